@@ -1,0 +1,1 @@
+"""elpd_drivers: hardware, files and simulated worlds behind the seams of `elpd.ports`."""

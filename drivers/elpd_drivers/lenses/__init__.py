@@ -1,0 +1,1 @@
+"""Lens controllers over a serial line."""

@@ -1,0 +1,1 @@
+"""Simulated controllers: real wire protocols in front of the simulated lens."""

@@ -1,0 +1,78 @@
+"""The command line: one file per command, loaded when it is called.
+
+`elpd --help` must not import numba, so the group knows its commands by name and imports a command's module only to run
+it (or to print its own help). Everything that programs read goes to stdout as one JSON object; everything for people
+that is not the answer goes to stderr.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import cast
+
+import click
+
+from elpd import __version__
+from elpd.cli.common import report_error
+from elpd.errors import ElpdError
+
+COMMANDS = {
+    "check": "what is installed, what is plugged in, and does it work",
+    "decode": "what an event file holds",
+    "demo": "focus the embedded simulated rig, live in the terminal",
+    "detect": "the causal detector over a recorded sweep",
+    "expose": "stage 1 alone: open the aperture, make the map",
+    "focus": "one focus cycle",
+    "replay": "run a recorded cycle again, to the same decision",
+    "sim-board": "a simulated lens controller on a pty",
+    "temporal-map": "an HDR picture from a recorded aperture opening",
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands live in ``elpd.cli.<name>`` and are imported on demand."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Name every command, without importing any."""
+        del ctx
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command's module and return its ``command``."""
+        del ctx
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"elpd.cli.{cmd_name.replace('-', '_')}")
+        return cast("click.Command", module.command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands from the table, so that help stays light."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(COMMANDS.items()))
+
+
+@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="elpd")
+def root() -> None:
+    """Real-time autofocus for event cameras."""
+
+
+def main() -> None:
+    """Run the command line; every error ends here, without a traceback, with its own exit code."""
+    as_json = "--json" in sys.argv
+    try:
+        code = root.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    except click.ClickException as error:
+        report_error("UsageError", error.format_message(), as_json=as_json)
+        sys.exit(2)
+    except ElpdError as error:
+        report_error(error.kind, str(error), as_json=as_json)
+        sys.exit(error.exit_code)
+    except BrokenPipeError:
+        sys.exit(0)
+    sys.exit(code if isinstance(code, int) else 0)

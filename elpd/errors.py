@@ -1,0 +1,66 @@
+"""What can go wrong, as a tree.
+
+::
+
+    ElpdError
+    ├── UsageError            what the caller asked for cannot be done (exit code 2)
+    │   ├── ConfigError       a configuration file or key
+    │   └── FormatError       a file that is not what it claims to be
+    ├── DeviceError           machinery broke (exit code 3); latched by the daemon
+    │   ├── CameraError       camera missing, lost, or speaking nonsense
+    │   └── LensError         lens missing, lost, silent, alarmed, or running away
+    ├── BusyError             somebody else holds the rig (exit code 4)
+    └── ReplayDiverged        a recorded run did not replay to the same calls
+
+A focus that was not found is *not* an error: it is an ``Outcome`` (``elpd.records``). Every message says what was
+measured, what the limit was, and what to do next.
+"""
+
+
+class ElpdError(Exception):
+    """Base of everything elpd raises on purpose. ``kind`` is the stable word that programs read."""
+
+    exit_code = 1
+
+    @property
+    def kind(self) -> str:
+        """The class name, which is the stable word of the JSON interfaces."""
+        return type(self).__name__
+
+
+class UsageError(ElpdError):
+    """The request itself is wrong; nothing was moved."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """A configuration file, key or value is wrong."""
+
+
+class FormatError(UsageError):
+    """A file is not what it claims to be, or is damaged beyond use."""
+
+
+class DeviceError(ElpdError):
+    """Machinery broke. The lens has been told to stop before this is raised."""
+
+    exit_code = 3
+
+
+class CameraError(DeviceError):
+    """The camera is missing, lost, or its data make no sense."""
+
+
+class LensError(DeviceError):
+    """The lens controller is missing, lost, silent, alarmed, or does not obey."""
+
+
+class BusyError(ElpdError):
+    """Somebody else holds the rig."""
+
+    exit_code = 4
+
+
+class ReplayDiverged(ElpdError):  # noqa: N818  (a finding about a recording, not a fault of the program)
+    """A recorded run asked its devices something else than it did when it was recorded."""

@@ -1,0 +1,1 @@
+"""Where the lens is, and how to make it rest where it should."""

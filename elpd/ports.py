@@ -1,0 +1,285 @@
+"""The only seams: Protocols that hardware, simulators, recordings and test doubles fill.
+
+A seam is right when its test double fits in twenty lines, so each has at most six methods. What only some devices
+can do is a small protocol of its own (``HardwareRoi``, ``Biases`` and so on), asked for once with ``isinstance``.
+
+Time moves only when somebody waits: ``EventCamera.read`` and ``Clock.sleep_until`` are the two places. That is why the
+same loop runs against hardware in real time and against a simulated world bit-exactly, without threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from elpd.records import (
+        BiasSet,
+        CameraPacket,
+        CommandStamp,
+        FocusResult,
+        Geometry,
+        LensCapabilities,
+        LensLimits,
+        LensReport,
+        PositionEstimate,
+        Roi,
+        StopMode,
+    )
+    from elpd.units import HostNs, Steps
+
+
+class Clock(Protocol):
+    """The host's monotonic clock, real or virtual."""
+
+    def now_ns(self) -> HostNs:
+        """Return the present instant."""
+        ...
+
+    def sleep_until(self, when: HostNs) -> None:
+        """Return at *when* or later; at once if it has passed."""
+        ...
+
+
+class BytePort(Protocol):
+    """A serial line. Neither method waits for the far end."""
+
+    def write(self, data: bytes) -> None:
+        """Hand *data* to the line in one write. Raises ``LensError`` if the line is dead or full."""
+        ...
+
+    def read_available(self) -> bytes:
+        """Return what has arrived, possibly nothing. Raises ``LensError`` if the line is dead."""
+        ...
+
+    def close(self) -> None:
+        """Give the line back. Idempotent."""
+        ...
+
+
+class EventCamera(Protocol):
+    """A source of events."""
+
+    @property
+    def geometry(self) -> Geometry:
+        """The sensor's size."""
+        ...
+
+    def start(self) -> None:
+        """Begin to deliver. Raises ``CameraError``."""
+        ...
+
+    def read(self, timeout_s: float) -> CameraPacket | None:
+        """Wait up to *timeout_s* for a packet; its arrays are valid until the next call.
+
+        Returns ``None`` when nothing came. Raises ``CameraError`` when the camera is gone or a recording has ended.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Stop delivering. Idempotent."""
+        ...
+
+
+class Lens(Protocol):
+    """A stepper-driven lens. Positions in motor microsteps; positive is towards ``limits.max_steps``.
+
+    No method waits for motion to end but ``home``. Every motion is bounded: ``move_to`` by its target, ``run`` by its
+    *until* and by the limits, whichever comes first.
+    """
+
+    @property
+    def limits(self) -> LensLimits:
+        """Travel and speed that nothing exceeds."""
+        ...
+
+    @property
+    def capabilities(self) -> LensCapabilities:
+        """What this controller can truly do."""
+        ...
+
+    def home(self, deadline: HostNs) -> LensReport:
+        """Find the reference, return when at rest. Raises ``LensError`` past *deadline*."""
+        ...
+
+    def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
+        """Start an absolute move. Raises ``LensError`` if unreferenced, ``UsageError`` if outside the limits."""
+        ...
+
+    def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
+        """Start (or change to, or reverse to) a signed velocity, ending at *until* or the limit at the latest."""
+        ...
+
+    def stop(self, mode: StopMode) -> CommandStamp:
+        """Send the stop bytes now, from any thread, behind nothing. Idempotent. Returns before motion has ended."""
+        ...
+
+    def poll(self) -> LensReport | None:
+        """Ask if it is time to, read what has come, and return the newest report if there is a new one.
+
+        Never waits. Raises ``LensError`` when the controller is lost, alarmed, or has not answered within its limit.
+        """
+        ...
+
+    def position_at(self, when: HostNs) -> PositionEstimate:
+        """Return where the motor was at *when*, from commands and reports. Raises ``LensError`` if unknown."""
+        ...
+
+
+class Aperture(Protocol):
+    """An iris or shutter that can open over the sensor."""
+
+    def open(self) -> CommandStamp:
+        """Start to open. Returns before it is open."""
+        ...
+
+    def close(self) -> CommandStamp:
+        """Start to close. Returns before it is closed."""
+        ...
+
+    @property
+    def opening_ms(self) -> float:
+        """How long opening takes, from command to fully open; an upper bound."""
+        ...
+
+    def transmittance(self, since_open_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the transmittance, 0 to 1, at times after the opening began."""
+        ...
+
+
+# --- optional abilities ------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class HardwareRoi(Protocol):
+    """A camera that can switch pixels off outside a window."""
+
+    def set_window(self, window: Roi | None) -> None:
+        """Deliver only *window*, or everything again with ``None``."""
+        ...
+
+
+@runtime_checkable
+class Biases(Protocol):
+    """A camera whose sensor can be biased differently for exposing and for focusing."""
+
+    def apply_biases(self, biases: BiasSet) -> None:
+        """Switch. Events of the next few milliseconds belong to neither setting."""
+        ...
+
+
+@runtime_checkable
+class PixelMask(Protocol):
+    """A camera that can switch single pixels off."""
+
+    def set_mask(self, pixels: Sequence[tuple[int, int]]) -> int:
+        """Switch off the given (x, y), as many as the hardware can; return how many that were."""
+        ...
+
+
+@runtime_checkable
+class Latency(Protocol):
+    """A camera that knows how long its data take at the least, from pixel to host."""
+
+    @property
+    def min_latency_us(self) -> float:
+        """The shortest delay between an event and the host's receipt of its packet."""
+        ...
+
+
+@runtime_checkable
+class Closeable(Protocol):
+    """Anything to give back at the end."""
+
+    def close(self) -> None:
+        """Give everything back. Idempotent."""
+        ...
+
+
+# --- whole rigs, boards and files: what the entry-point groups deliver -------------------------------------------
+
+
+class Truth(Protocol):
+    """What only a simulated rig knows."""
+
+    def errors(self, result: FocusResult) -> dict[str, float | None]:
+        """Return ``focus_um estimate_error_um stop_error_um final_error_um`` for a finished cycle."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RigParts:
+    """Devices that share a world: what an entry point of the group ``elpd.rigs`` returns."""
+
+    clock: Clock
+    camera: EventCamera
+    lens: Lens
+    aperture: Aperture | None
+    um_per_step: float
+    truth: Truth | None = None
+
+
+class RunningBoard(Protocol):
+    """A simulated controller behind a pty."""
+
+    @property
+    def port(self) -> str:
+        """The path that any program can open as a serial port."""
+        ...
+
+    def close(self) -> None:
+        """Stop serving and remove the pty. Idempotent."""
+        ...
+
+
+class Board(Protocol):
+    """A simulated controller: what an entry point of the group ``elpd.boards`` names."""
+
+    def serve(self, settings: Mapping[str, Any]) -> RunningBoard:
+        """Open a pty and serve it from a thread, in real time, until closed."""
+        ...
+
+
+class RecordingReader(Protocol):
+    """An open event file."""
+
+    @property
+    def geometry(self) -> Geometry | None:
+        """The sensor's size, where the file or its sensor's name says it."""
+        ...
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """What the file says beside events: header fields, counters, warnings, loss; complete once read through."""
+        ...
+
+    def packets(self, max_bytes: int = 1 << 20) -> Iterator[CameraPacket]:
+        """Yield the file from its beginning, in pieces of bounded memory; ``received_ns`` is zero."""
+        ...
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        ...
+
+
+class RecordingFormat(Protocol):
+    """A file format: what an entry point of the group ``elpd.formats`` names."""
+
+    @property
+    def name(self) -> str:
+        """The word that `elpd decode` prints, such as ``EVT3``; a family name where one reader serves several."""
+        ...
+
+    def recognises(self, path: Path) -> bool:
+        """Say from the first bytes (not the suffix) whether this format can read the file."""
+        ...
+
+    def open(self, path: Path) -> RecordingReader:
+        """Open for reading. Raises ``FormatError`` with what was found and what was expected."""
+        ...

@@ -1,0 +1,1 @@
+"""What the events say: sums, references, tests and estimates. No clock, no device, no log in here."""
