@@ -127,12 +127,13 @@ def believe(
     slots: NDArray[np.int32],
     jitter: float,
 ) -> int:
-    """Move each pixel whose *choice* its neighbours do not support to its next slot; return how many moved.
+    """Move each pixel whose *choice* its neighbours contradict to its next slot; return how many moved.
 
     One Jacobi pass: everything is judged by *times* as they stood, so the order of pixels does not matter.
-    A pixel is supported when ``SUPPORT`` neighbours have fired before ``time + TOLERANCE_SIGMA * sigma``, sigma being
-    the neighbours' own robust spread, and not less than *jitter* (relative) times their median. A pixel with fewer
-    than ``SUPPORT + 1`` fired neighbours is alone in the dark, and counts as unfired when its slots are exhausted.
+    A time stands when ``SUPPORT`` neighbours fired earlier or at most a tolerance later, and as many later or at most
+    a tolerance earlier. The tolerance is ``TOLERANCE_SIGMA`` times the neighbours' robust spread, or *jitter* times
+    their median if that is more. Too early, with no better slot: hot. Too late: the light's event was missed, which
+    counts as unfired, and so does a pixel with at most ``SUPPORT`` fired neighbours, alone in the dark.
     """
     height, width = times.shape
     near = np.empty(8, np.int32)
@@ -146,36 +147,46 @@ def believe(
             new_choice[row, column] = slot
             if slot >= HOT:
                 continue
-            surely = own + TOLERANCE_SIGMA * jitter * own
-            fired = 0
-            supporters = 0
+            margin = TOLERANCE_SIGMA * jitter * own
+            fired = silent = early = late = 0
             for r in range(max(row - 1, 0), min(row + 2, height)):
                 for c in range(max(column - 1, 0), min(column + 2, width)):
-                    value = times[r, c]
-                    if (r == row and c == column) or value == EMPTY:
+                    if r == row and c == column:
                         continue
-                    if value <= surely:
-                        supporters += 1
+                    value = times[r, c]
+                    if value == EMPTY:
+                        silent += 1
+                        continue
+                    early += value <= own + margin
+                    late += value >= own - margin
                     near[fired] = value
                     fired += 1
+            late += silent
+            limit = np.float64(EMPTY)
+            verdict = UNFIRED
             if fired > SUPPORT:
-                if supporters >= SUPPORT:
+                if early >= SUPPORT and late >= SUPPORT:
                     continue
                 sort_few(near, fired)
                 middle = near[fired // 2]
                 for i in range(fired):
                     deviation[i] = abs(near[i] - middle)
                 sort_few(deviation, fired)
-                sigma = max(SIGMA_PER_MAD * deviation[fired // 2], jitter * middle)
-                if near[SUPPORT - 1] <= own + TOLERANCE_SIGMA * sigma:
+                tolerance = TOLERANCE_SIGMA * max(SIGMA_PER_MAD * deviation[fired // 2], jitter * middle)
+                too_early = near[SUPPORT - 1] > own + tolerance
+                too_late = late < SUPPORT and near[fired - SUPPORT + silent] < own - tolerance
+                if not too_early and not too_late:
                     continue
+                limit = min(near[fired - 1] + tolerance, limit)
+                if too_early:
+                    verdict = HOT
             moved += 1
             following = slot + 1
-            if following < HOT and slots[following, row, column] != EMPTY:
+            if following < HOT and slots[following, row, column] < limit:
                 new_choice[row, column] = following
                 new_times[row, column] = slots[following, row, column]
             else:
-                new_choice[row, column] = HOT if fired > SUPPORT else UNFIRED
+                new_choice[row, column] = verdict
                 new_times[row, column] = EMPTY
     return moved
 
@@ -185,7 +196,7 @@ class FirstTimes:
     """The believed first ON times of one opening.
 
     ``times_us`` is (height, width) int32 relative to ``begin_us``, ``EMPTY`` where nothing is believed. ``hot`` marks
-    pixels whose events no neighbour supports, ``unfired`` those that did not fire, or fired alone in the dark.
+    pixels that fired too early for their neighbours, ``unfired`` those that did not fire, too late, or alone.
     ``fired_fraction`` counts every pixel with an ON event in the interval, believed or not; ``second_thoughts`` how
     many pixels had their first event taken for noise and a later one believed.
     """
