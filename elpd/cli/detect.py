@@ -14,8 +14,11 @@ from elpd.errors import FormatError, UsageError
 from elpd.record.layouts import read_sweep
 from elpd.record.sweep_file import SweepSearch
 from elpd.records import Outcome
-from elpd.vision.reference import check_size, load_image, reference_from_frame
+from elpd.units import SensorUs
+from elpd.vision.first_events import FirstEventMap
+from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
 from elpd.vision.ruler import Ruler
+from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
     from elpd.record.sweep_file import Detection
@@ -63,11 +66,18 @@ def command(
             f"{sweep.geometry.width}x{sweep.geometry.height} pixels"
         )
     reference = None
+    begin_us = None
+    if aperture_us is not None:
+        first = FirstEventMap(sweep.geometry, *aperture_us)
+        first.add(sweep.t_us, sweep.x, sweep.y, sweep.on)
+        picture = temporal_image(first.believed(), read_transmittance(transmittance), SensorUs(aperture_us[0]))
+        reference = reference_from_temporal_image(picture, roi)
+        begin_us = aperture_us[1]
     if reference_path is not None:
         pixels = load_image(reference_path)
         check_size(pixels.shape, sweep.geometry, str(reference_path))
         reference = reference_from_frame(pixels, roi)
-    search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, reference=reference)
+    search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)
     found = search.run()
     if as_json:
         print_json(_answer(found))

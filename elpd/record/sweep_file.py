@@ -31,6 +31,8 @@ from elpd.vision.reference import Reference, check_size, reference_from_frame
 from elpd.vision.track import EventEnergy, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from elpd.record.layouts import RecordedSweep
     from elpd.records import ElpSample, Roi
     from elpd.vision.ruler import Ruler
@@ -174,7 +176,7 @@ class SweepSearch:
         self._taken = until
         self._image_track.add(sample.end_us, self._ruler.position(sample.end_us), self._energy.measure())
 
-    def _frame(self, t_us: int, pixels: np.ndarray) -> Detection | None:
+    def _frame(self, t_us: int, pixels: NDArray[np.generic]) -> Detection | None:
         check_size(pixels.shape, self._sweep.geometry, f"frame of {t_us} us")
         reference = reference_from_frame(pixels, self._roi)
         if self._reference is None and not reference.textured:
@@ -246,10 +248,22 @@ class SweepSearch:
         if peak_us <= flank_us:
             return None
         said = ask_events(
-            events, sign * ruler.position(flank_us), sign * ruler.position(peak_us), sign * ruler.position(now_us)
+            events,
+            sign * ruler.position(flank_us),
+            sign * ruler.position(peak_us),
+            sign * ruler.position(now_us),
+            self._brightness(),
         )
         self._width = said.vertex.width if said.vertex is not None else None
         return [replace(one, at=sign * one.at) for one in said.witnesses()]
+
+    def _brightness(self) -> NDArray[np.float32] | None:
+        """Return the reference's brightness over the cut-out."""
+        if self._reference is None:
+            return None
+        roi, cut = self._roi, self._stretch
+        left, top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
+        return np.ascontiguousarray(self._reference.brightness[top : top + cut.height, left : left + cut.width])
 
     def _width_of(self, witnesses: list[Witness]) -> float:
         frames = self._frames.vertex() if witnesses and witnesses[0].name == "frames" else None

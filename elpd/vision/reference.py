@@ -51,9 +51,9 @@ class Reference:
         How many standard deviations the picture's structure stands above what noise alone would show.
     scale_px:
         Standard deviation of the Laplacian of Gaussian that made the weights.
-    mean_log:
-        Smooth brightness relative to its mean in the ROI, (height, width) ``float32``: how much a pixel's events are
-        worth when event energies are summed.
+    brightness:
+        Linear intensity relative to the brightest parts of the ROI, (height, width) ``float32``: how fast a pixel's
+        photoreceptor is, and how much its events are worth when energies are summed.
     """
 
     weights: NDArray[np.int16]
@@ -165,10 +165,12 @@ def _quantise(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArr
 def _relative_brightness(
     image: NDArray[np.float32], ground: float | None, usable: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    if ground is None or not usable.any():
+    """Return linear intensity over that of the brightest parts, capped there, so that one lamp is no yardstick."""
+    linear = np.exp(image - np.float32(image.max())) if ground is None else image
+    top = float(np.percentile(linear[usable], _CLIP_PERCENTILE)) if usable.any() else 0.0
+    if top <= 0.0:
         return np.ones_like(image)
-    smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(ground)
-    return np.asarray(smooth / np.float32(smooth[usable].mean()), dtype=np.float32)
+    return np.asarray(np.minimum(linear / np.float32(top), 1.0), dtype=np.float32)
 
 
 def _laplacian_of_gaussian(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
