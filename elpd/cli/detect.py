@@ -13,7 +13,7 @@ from elpd.cli.common import json_option, parse_interval_us, parse_roi, print_jso
 from elpd.errors import FormatError, UsageError
 from elpd.record.layouts import read_sweep
 from elpd.record.sweep_file import SweepSearch
-from elpd.records import Outcome
+from elpd.records import Geometry, Outcome
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
@@ -56,7 +56,9 @@ def command(
     ruler = _ruler(speed_um_s, lens_path)
     if dof_um is not None and not dof_um > 0.0:
         raise UsageError(f"--dof-um must be positive; got {dof_um}")
-    sweep = read_sweep(path, frames=frames)
+    pixels = None if reference_path is None else load_image(reference_path)
+    size = None if pixels is None else Geometry(pixels.shape[1], pixels.shape[0])
+    sweep = read_sweep(path, frames=frames, size=size)
     for warning in sweep.warnings:
         print(f"elpd: {path}: {warning}", file=sys.stderr)
     roi = roi or sweep.roi
@@ -73,8 +75,7 @@ def command(
         picture = temporal_image(first.believed(), read_transmittance(transmittance), SensorUs(aperture_us[0]))
         reference = reference_from_temporal_image(picture, roi)
         begin_us = aperture_us[1]
-    if reference_path is not None:
-        pixels = load_image(reference_path)
+    if pixels is not None:
         check_size(pixels.shape, sweep.geometry, str(reference_path))
         reference = reference_from_frame(pixels, roi)
     search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)

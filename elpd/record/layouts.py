@@ -70,34 +70,41 @@ class RecordedSweep:
     warnings: tuple[str, ...] = field(default=())
 
 
-def read_sweep(path: Path, *, frames: str | None = None) -> RecordedSweep:
+def read_sweep(path: Path, *, frames: str | None = None, size: Geometry | None = None) -> RecordedSweep:
     """Read a sweep from a folder, an ``.npz``, or an event file.
 
-    *frames* names a folder relative to *path*, or is ``"none"``; by default the authors' folders are tried.
+    *frames* names a folder relative to *path*, or is ``"none"``; by default the authors' folders are tried. *size* is
+    the sensor's, where the caller knows it and the file may not.
     Raises ``FormatError`` for what is not a sweep, ``UsageError`` for what does not exist.
     """
     if not path.exists():
         raise UsageError(f"{path}: no such file or folder")
     if path.is_dir():
-        return _read_folder(path, frames)
+        return _read_folder(path, frames, size)
     columns, geometry, warnings = _read_events(path)
     found = _frames_in(path.parent / frames) if frames not in (None, "none") else ()
-    return _assemble(path, columns, geometry, None, found, warnings)
+    return _assemble(path, columns, geometry or size, None, found, warnings)
 
 
-def _read_folder(folder: Path, frames: str | None) -> RecordedSweep:
+def _read_folder(folder: Path, frames: str | None, size: Geometry | None) -> RecordedSweep:
     events = folder / EVENTS_NAME
     if not events.is_file():
         inside = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6]) or "nothing"
         raise FormatError(f"{folder}: no {EVENTS_NAME} in this folder (it holds {inside}); give a sweep's folder")
-    if frames == "none":
-        found: tuple[FrameFile, ...] = ()
-    elif frames is not None:
-        found = _frames_in(folder / frames)
-    else:
-        found = next((_frames_in(folder / name) for name in FRAME_FOLDERS if (folder / name).is_dir()), ())
+    usual = next((name for name in FRAME_FOLDERS if (folder / name).is_dir()), None)
+    chosen = usual if frames is None else frames
+    found = () if chosen in (None, "none") else _frames_in(folder / chosen)
     columns, geometry, warnings = _read_events(events)
+    # The size of a frame is a fact of the camera; it may be known where the frames themselves are not to be used.
+    geometry = geometry or size or _frame_size(found or (_frames_in(folder / usual) if usual else ()))
     return _assemble(folder, columns, geometry, _region(folder / INFO_NAME), found, warnings)
+
+
+def _frame_size(frames: Sequence[FrameFile]) -> Geometry | None:
+    if not frames:
+        return None
+    height, width = frames[0].load().shape[:2]
+    return Geometry(width, height)
 
 
 def _region(info: Path) -> tuple[int, int, int, int] | None:
@@ -217,7 +224,7 @@ def _assemble(
     y = columns["y"].astype(np.int64)
     on = (columns["p"] > 0).astype(np.uint8)
     if geometry is None:
-        geometry = _size_of(frames, x, y, region)
+        geometry = _frame_size(frames) or _size_of(x, y, region)
     outside = (x < 0) | (y < 0) | (x >= geometry.width) | (y >= geometry.height)
     if outside.any():
         raise FormatError(
@@ -240,19 +247,11 @@ def _assemble(
     )
 
 
-def _size_of(
-    frames: Sequence[FrameFile],
-    x: NDArray[np.int64],
-    y: NDArray[np.int64],
-    region: tuple[int, int, int, int] | None,
-) -> Geometry:
-    """Return the sensor's size: that of a frame, or the smallest known sensor that holds events and region.
+def _size_of(x: NDArray[np.int64], y: NDArray[np.int64], region: tuple[int, int, int, int] | None) -> Geometry:
+    """Return the smallest known sensor that holds the events and the region.
 
     Not simply the events' extent: it would depend on how long the recording is, and so would the answer.
     """
-    if frames:
-        height, width = frames[0].load().shape[:2]
-        return Geometry(width, height)
     right = max(int(x.max()) + 1, region[3] if region else 0)
     bottom = max(int(y.max()) + 1, region[1] if region else 0)
     for width, height in _SENSOR_SIZES:

@@ -39,7 +39,7 @@ WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 
 SYSTEMATIC_FRAMES = 0.012
 SYSTEMATIC_VERTEX = 0.05
-SYSTEMATIC_PAIRS = 0.03
+SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
 SYSTEMATIC_CROSSING = 0.25
@@ -92,12 +92,6 @@ class Lag:
     sigma: float = 0.0
     typical: float = 0.0
 
-    @property
-    def known(self) -> bool:
-        """Whether it was measured at all."""
-        return self.sigma > 0.0
-
-
 @dataclass(frozen=True, slots=True)
 class EventWitnesses:
     """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
@@ -112,9 +106,7 @@ class EventWitnesses:
         if self.vertex is None:
             return found
         width = self.vertex.width
-        unknown = SYSTEMATIC_VERTEX * width
-        if self.lag.known:
-            unknown = float(np.hypot(SYSTEMATIC_PAIRS * width, self.lag.sigma * self.lag.typical))
+        unknown = float(np.hypot(SYSTEMATIC_VERTEX * width, self.lag.sigma * self.lag.typical))
         found.append(Witness("vertex", self.vertex.at, float(np.hypot(self.vertex.sigma, unknown))))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
             # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
