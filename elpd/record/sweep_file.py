@@ -17,11 +17,12 @@ from elpd.records import Direction, FocusEstimate, Outcome
 from elpd.vision.crossing import (
     FLANK,
     ROI_MARGIN_PX,
-    SYSTEMATIC_FRAMES,
+    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
     EventStretch,
     Witness,
     ask_events,
+    frame_witness,
     fuse,
 )
 from elpd.vision.detector import Detector
@@ -205,9 +206,8 @@ class SweepSearch:
             vertex = self._frames.vertex()
             if vertex is None or (self._detector.likely_crossing_us is None and self._frames.drop < _PATIENT_DROP):
                 return None
-            sigma = float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * vertex.width))
-            witnesses.append(Witness("frames", vertex.at, sigma))
-            limit = vertex.width / WIDTHS_PER_DEPTH_OF_FOCUS
+            spacing = float(np.median(np.abs(np.diff(self._frames.positions))))
+            witnesses.append(frame_witness(vertex, spacing))
         elif not self._image_peak_passed():
             return None
         self._attempts_until = self._detector.samples + _RETRY_EVERY
@@ -258,7 +258,8 @@ class SweepSearch:
             self._brightness(),
         )
         self._width = said.vertex.width if said.vertex is not None else None
-        return [replace(one, at=sign * one.at) for one in said.witnesses()]
+        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
+        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)]
 
     def _brightness(self) -> NDArray[np.float32] | None:
         """Return the reference's brightness over the cut-out."""
