@@ -12,6 +12,7 @@ import numpy as np
 from elpd.cli.common import json_option, parse_interval_us, parse_roi, print_json
 from elpd.errors import FormatError, UsageError
 from elpd.record.layouts import read_sweep
+from elpd.record.paper_sweep import detect_as_published
 from elpd.record.sweep_file import SweepSearch
 from elpd.records import Geometry, Outcome
 from elpd.units import SensorUs
@@ -22,6 +23,7 @@ from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
     from elpd.record.sweep_file import Detection
+    from elpd.records import TemporalImage
 
 
 @click.command(name="detect")
@@ -69,6 +71,7 @@ def command(
         )
     reference = None
     begin_us = None
+    picture = None
     if aperture_us is not None:
         first = FirstEventMap(sweep.geometry, *aperture_us)
         first.add(sweep.t_us, sweep.x, sweep.y, sweep.on)
@@ -78,13 +81,26 @@ def command(
     if pixels is not None:
         check_size(pixels.shape, sweep.geometry, str(reference_path))
         reference = reference_from_frame(pixels, roi)
+    if method == "paper":
+        found = detect_as_published(sweep, roi, pixels if picture is None else _as_published(picture), begin_us)
+        return _finish(found, as_json=as_json)
     search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)
-    found = search.run()
+    return _finish(search.run(), as_json=as_json)
+
+
+def _finish(found: Detection, *, as_json: bool) -> int:
     if as_json:
         print_json(_answer(found))
     else:
         _tell(found)
     return 0 if found.outcome is Outcome.FOCUSED else 1
+
+
+def _as_published(picture: TemporalImage) -> np.ndarray:
+    """Return a temporal map as its authors' code writes it: linear, stretched, to the power 1.5, read as 8 bit."""
+    linear = np.exp(picture.log_intensity.astype(np.float64))
+    stretched = (linear - linear.min()) / max(float(np.ptp(linear)), 1e-12)
+    return np.asarray(np.rint(255.0 * stretched**1.5), dtype=np.uint8)
 
 
 def _ruler(speed_um_s: float | None, lens_path: Path | None) -> Ruler:

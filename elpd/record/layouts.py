@@ -38,6 +38,7 @@ FRAME_FOLDERS = ("davis_frames_50", "frames", "davis_frames_20", "davis_frames_1
 
 _FRAME_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".pgm", ".bmp"}
 _REGION = re.compile(r"roi[^:=\n]*[:=]\s*\(?\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)", re.IGNORECASE)
+_BIN = re.compile(r"^\s*delta_t\s*[:=]\s*(\d+(?:\.\d+)?)", re.IGNORECASE | re.MULTILINE)
 _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (1280, 720))
 
 
@@ -58,6 +59,7 @@ class RecordedSweep:
     """A sweep on disk: events in time order, frames, and the region its makers chose.
 
     ``t_us`` ``int64``, ``x`` and ``y`` ``uint16``, ``on`` ``uint8`` (1 brighter, 0 darker), all of one length.
+    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it.
     """
 
     t_us: NDArray[np.int64]
@@ -67,6 +69,7 @@ class RecordedSweep:
     geometry: Geometry
     roi: Roi
     frames: tuple[FrameFile, ...] = ()
+    bin_us: int | None = None
     warnings: tuple[str, ...] = field(default=())
 
 
@@ -83,7 +86,7 @@ def read_sweep(path: Path, *, frames: str | None = None, size: Geometry | None =
         return _read_folder(path, frames, size)
     columns, geometry, warnings = _read_events(path)
     found = _frames_in(path.parent / frames) if frames not in (None, "none") else ()
-    return _assemble(path, columns, geometry or size, None, found, warnings)
+    return _assemble(path, columns, geometry or size, _Info(), found, warnings)
 
 
 def _read_folder(folder: Path, frames: str | None, size: Geometry | None) -> RecordedSweep:
@@ -97,7 +100,7 @@ def _read_folder(folder: Path, frames: str | None, size: Geometry | None) -> Rec
     columns, geometry, warnings = _read_events(events)
     # The size of a frame is a fact of the camera; it may be known where the frames themselves are not to be used.
     geometry = geometry or size or _frame_size(found or (_frames_in(folder / usual) if usual else ()))
-    return _assemble(folder, columns, geometry, _region(folder / INFO_NAME), found, warnings)
+    return _assemble(folder, columns, geometry, _read_info(folder / INFO_NAME), found, warnings)
 
 
 def _frame_size(frames: Sequence[FrameFile]) -> Geometry | None:
@@ -107,14 +110,23 @@ def _frame_size(frames: Sequence[FrameFile]) -> Geometry | None:
     return Geometry(width, height)
 
 
-def _region(info: Path) -> tuple[int, int, int, int] | None:
-    """Return (y1, y2, x1, x2) of ``info.txt``, and nothing else of it."""
+@dataclass(frozen=True, slots=True)
+class _Info:
+    """What is taken from ``info.txt``, and nothing else of it: (y1, y2, x1, x2), and the authors' bin."""
+
+    region: tuple[int, int, int, int] | None = None
+    bin_us: int | None = None
+
+
+def _read_info(info: Path) -> _Info:
     try:
         text = info.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return None
-    match = _REGION.search(text)
-    return None if match is None else tuple(int(part) for part in match.groups())  # type: ignore[return-value]
+        return _Info()
+    region = _REGION.search(text)
+    width = _BIN.search(text)
+    y1, y2, x1, x2 = (int(part) for part in region.groups()) if region else (0, 0, 0, 0)
+    return _Info((y1, y2, x1, x2) if region else None, round(float(width.group(1))) if width else None)
 
 
 def _frames_in(folder: Path) -> tuple[FrameFile, ...]:
@@ -207,11 +219,12 @@ def _assemble(
     path: Path,
     columns: dict[str, NDArray[Any]],
     geometry: Geometry | None,
-    region: tuple[int, int, int, int] | None,
+    info: _Info,
     frames: Sequence[FrameFile],
     warnings: Sequence[str],
 ) -> RecordedSweep:
     notes = list(warnings)
+    region = info.region
     sizes = {name: column.size for name, column in columns.items()}
     if not columns or not all(sizes.values()):
         raise FormatError(f"{path}: no events in it; nothing can be focused from an empty recording")
@@ -243,7 +256,7 @@ def _assemble(
         else:
             notes.append(f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor; all of it used")
     return RecordedSweep(
-        t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), tuple(notes)
+        t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), info.bin_us, tuple(notes)
     )
 
 
