@@ -1,9 +1,9 @@
 """Several witnesses, one focus position, one standard error.
 
-Mirror pairs, the vertex of the events' own image, the vertex of frames and the zero crossing of ELP each say where focus
-was. They fail for different reasons: pairs under scene motion, the events' vertex by the unanswered pixels at its end,
-frames by exposure, the crossing always late. So they are fused by their standard errors, which hold, beside the
-scatter, what is known to be systematic. Widths and errors are in units of the curve's own width (``Vertex.width``),
+Mirror pairs, the vertex of the events' own image, the vertex of frames and the zero crossing of ELP each say where
+focus was. They fail for different reasons: pairs under scene motion, the events' vertex by pixels that have not
+answered yet, frames by exposure, the crossing (never used here) always late. So they are fused by their standard
+errors, which hold, beside scatter, what is known to be systematic. Widths and errors are in units of the curve's own width (``Vertex.width``),
 a fifth of which is a depth of focus, so that nothing here depends on scene, optics or speed. Witnesses that disagree
 beyond their errors widen the answer's.
 """
@@ -110,6 +110,7 @@ class Lag:
     sigma: float = 0.0
     typical: float = 0.0
 
+
 @dataclass(frozen=True, slots=True)
 class EventWitnesses:
     """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
@@ -123,7 +124,7 @@ class EventWitnesses:
 
         *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured.
         """
-        found = []
+        found: list[Witness] = []
         if self.vertex is None:
             return found
         width = self.vertex.width

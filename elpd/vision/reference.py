@@ -17,7 +17,6 @@ A picture without structure above its own noise is refused before anything moves
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -26,6 +25,8 @@ import numpy as np
 from elpd.errors import FormatError, UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, TemporalImage
@@ -84,9 +85,9 @@ def reference_from_frame(pixels: NDArray[np.generic], roi: Roi, *, mask: NDArray
     image = np.ascontiguousarray(pixels, dtype=np.float32)
     if image.ndim != 2:
         raise UsageError(f"a reference is a grey image of two dimensions; this one has shape {image.shape}")
-    top = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else float("inf")
+    top = full_scale(pixels) or float("inf")
     valid = (image < top) if mask is None else (mask & (image < top))
-    step = _QUANTISATION_VARIANCE if np.issubdtype(pixels.dtype, np.integer) else 0.0
+    step = _QUANTISATION_VARIANCE if full_scale(pixels) else 0.0
     ground = max(float(image.mean()) * 0.02, 1.0 if step else 1e-6)
     return _build(image, ground, roi, valid, step)
 
@@ -107,6 +108,11 @@ def load_image(path: Path) -> NDArray[np.generic]:
     if image is None:
         raise FormatError(f"{path}: {data.size} bytes that are no image; PNG, JPEG, TIFF and PGM are read")
     return np.asarray(image)
+
+
+def full_scale(pixels: NDArray[np.generic]) -> float | None:
+    """Return the largest value that integer pixels can have; ``None`` for floats."""
+    return None if pixels.dtype.kind == "f" else float(2 ** (8 * pixels.dtype.itemsize) - 1)
 
 
 def check_size(shape: tuple[int, ...], geometry: Geometry, name: str) -> None:
@@ -187,7 +193,7 @@ def _noise_gain(scale_px: float) -> float:
 
 
 def _white_noise_variance(image: NDArray[np.float32]) -> float:
-    """Estimate noise from what no blurred picture contains (Immerkaer 1996), by the median, so that edges do not count."""
+    """Estimate noise from what no blurred picture contains (Immerkaer 1996), by the median, which edges do not move."""
     if min(image.shape) < 3:
         return 0.0
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)

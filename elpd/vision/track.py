@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from elpd.vision.integral import BANDS_PX, Vertex, add_events, band_energy, fit_vertex
+from elpd.vision.reference import full_scale
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -77,7 +78,7 @@ class PeakTrack:
         if near.size < 5:
             return 0.0
         second = np.diff(near, 2)
-        return float(np.median(np.abs(second - np.median(second)))) / 0.6745 / np.sqrt(6.0)
+        return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6.0))
 
     @property
     def passed(self) -> bool:
@@ -126,7 +127,7 @@ class FrameEnergy:
         roi, margin = self._roi, self._margin
         top, left = max(0, roi.y - margin), max(0, roi.x - margin)
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
-        scale = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+        scale = full_scale(pixels) or 1.0
         image = part.astype(np.float32) / np.float32(scale)
         if self._weight is None:
             smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(1e-6)
@@ -151,4 +152,6 @@ class EventEnergy:
 
     def measure(self) -> float:
         """Return log S now."""
-        return float(np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR))
+        return float(
+            np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR)
+        )
