@@ -38,6 +38,9 @@ _SCALES_PX = (1.0, 1.5, 2.2, 3.3, 5.0)
 _CLIP_PERCENTILE = 99.0
 _SIGNAL_TO_NOISE = 4.0
 _SHARE_OF_STRUCTURE = 0.5
+_COARSER = 3
+"""Steps from the finest scale that has structure to the one that is still there far from focus: 3.3 times coarser."""
+
 _TEXTURE_SIGMAS = 6.0
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 
@@ -148,10 +151,18 @@ def _build(
     best = int(np.argmax(structure >= _SHARE_OF_STRUCTURE * structure.max())) if structure.max() > 0.0 else -1
     chosen, response = _SCALES_PX[best], responses[best]
     brightness = _relative_brightness(filled, ground, usable)
+    coarse = responses[min(best + _COARSER, len(responses) - 1)] if best >= 0 else response
     if ground is not None:
-        response = response / (cv2.GaussianBlur(filled, (0, 0), 2.0 * chosen) + np.float32(ground))
-    weights = _quantise(response, usable)
+        local = cv2.GaussianBlur(filled, (0, 0), 2.0 * chosen) + np.float32(ground)
+        response, coarse = response / local, coarse / local
+    # Near focus events follow the fine structure; far from it only the coarse is left of the picture.
+    weights = _quantise(_unit(response, usable) + _unit(coarse, usable), usable)
     return Reference(weights, float(texture), chosen, brightness)
+
+
+def _unit(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    spread = float(np.sqrt(np.mean(np.square(response[usable], dtype=np.float64)))) if usable.any() else 0.0
+    return np.asarray(response / np.float32(spread), dtype=np.float32) if spread > 0.0 else response
 
 
 def _quantise(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.int16]:

@@ -73,11 +73,16 @@ class PeakTrack:
 
     @property
     def scatter(self) -> float:
-        """One standard deviation of a point about its neighbours' line, from second differences near the peak."""
-        near = np.array(self.values[max(0, self._peak - 8) :])
-        if near.size < 5:
+        """One standard deviation of the curve about a smooth one, at the scale of its own peak.
+
+        From second differences of up to 32 averages between the flank and now: neighbouring points share most of
+        their error, so their own differences would flatter them.
+        """
+        values = np.array(self.values[self.flank(1.0) :])
+        if values.size < 6:
             return 0.0
-        second = np.diff(near, 2)
+        means = np.array([part.mean() for part in np.array_split(values, min(32, values.size))])
+        second = np.diff(means, 2)
         return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6.0))
 
     @property
