@@ -15,6 +15,7 @@ import numpy as np
 
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
+from elpd.vision.integral import BANDS_PX, band_gain
 from elpd.vision.track import EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ MIN_EVENTS = 1_000
 
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
+
+LEAST_LEVEL = 1.0 / 3.0
+"""Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
+event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
 
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
@@ -60,6 +65,7 @@ class EventMemory:
         self._max_events = max_events
         self.track = PeakTrack()
         self.capped = 0
+        self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
@@ -89,7 +95,7 @@ class EventMemory:
     def peak_passed(self) -> bool:
         """Whether the image has become as sharp as it gets, and duller again, by enough events to believe it."""
         track = self.track
-        if not track.passed or track.rise < MIN_RISE:
+        if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
             return False
         begin_us = track.times_us[track.flank(FLANK)]
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
