@@ -34,7 +34,7 @@ PNG = click.Path(path_type=Path, dir_okay=False)
     default="iris",
     show_default=True,
     metavar="linear|iris|FILE",
-    help="How the aperture opens: its area evenly (linear), its diameter evenly (iris), or a CSV of t_us,transmittance.",
+    help="How it opens: area grows evenly (linear), diameter grows evenly (iris), or a CSV of t_us,transmittance.",
 )
 @click.option("--out", type=PNG, help="Write the picture as 16-bit PNG, monotone in log intensity.")
 @click.option("--display", type=PNG, help="Write an 8-bit PNG for eyes as well (1st to 99th percentile).")
@@ -81,7 +81,7 @@ def command(
     if as_json:
         print_json(answer)
     else:
-        _tell(image, answer["out"], "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
+        _tell(image, out, "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
 
 
 def _gather(file: Path, aperture: tuple[int, int] | None) -> FirstEventMap:

@@ -23,12 +23,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
+from elpd.events.evt2 import Evt2Decoder, Evt21Decoder
+from elpd.events.evt3 import Evt3Decoder
 from elpd.events.jit import kernel
+from elpd.events.layout import event_columns
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry
+    from elpd.events.decoder import WordDecoder
+    from elpd.records import CameraPacket, Geometry
+
+DECODERS: dict[Encoding, type[Evt2Decoder | Evt21Decoder | Evt3Decoder]] = {
+    Encoding.EVT2: Evt2Decoder,
+    Encoding.EVT21: Evt21Decoder,
+    Encoding.EVT3: Evt3Decoder,
+}
 
 SLOTS = 3
 """ON times kept per pixel. At 5 Hz of noise, 100 ms of waiting exhausts them in 1.4 % of the pixels."""
@@ -57,7 +68,8 @@ N_ON, N_BEFORE, N_AFTER, N_OUTSIDE = range(4)
 
 
 @kernel(
-    "void(int64[::1], uint16[::1], uint16[::1], uint8[::1], int64, int64, int64, int64,"
+    'void(Array(int64, 1, "C", readonly=True), Array(uint16, 1, "C", readonly=True),'
+    ' Array(uint16, 1, "C", readonly=True), Array(uint8, 1, "C", readonly=True), int64, int64, int64, int64,'
     " int32[:, ::1], uint16[::1], int64[::1])"
 )
 def latch_first_on(
@@ -76,7 +88,7 @@ def latch_first_on(
     """Add events to *slots* (3, height*width) and count the ON events *before* the interval, saturating."""
     n_on = n_before = n_after = n_outside = 0
     for i in range(t_us.size):
-        if on[i] == 0:
+        if on[i] != 1:
             continue
         column = np.int64(x[i])
         row = np.int64(y[i])
@@ -238,6 +250,7 @@ class FirstEventMap:
         self._slots = np.full((SLOTS, geometry.height, geometry.width), EMPTY, np.int32)
         self._before = np.zeros((geometry.height, geometry.width), np.uint16)
         self._tally = np.zeros(4, np.int64)
+        self._decoder: WordDecoder | None = None
         self.first_us: int | None = None
         self.last_us: int | None = None
 
@@ -266,6 +279,21 @@ class FirstEventMap:
         """Whether events at or past the interval's end have come, so that nothing more can change."""
         return self._end_us is not None and self.last_us is not None and self.last_us >= self._end_us
 
+    def add_packet(self, packet: CameraPacket) -> None:
+        """Add a camera's packet, events or words.
+
+        Words are decoded here, with the decoder's state carried from packet to packet: times are those of the stream
+        since its first packet *here*. Who has a decoder of the stream already gives its arrays to ``add`` instead.
+        """
+        if packet.encoding is Encoding.ARRAY:
+            self.add(*event_columns(packet.data))
+            return
+        if self._decoder is None:
+            self._decoder = DECODERS[packet.encoding](self.geometry)
+        if packet.gap_before:
+            self._decoder.forget_addresses()
+        self.add(*self._decoder.feed(packet.data))
+
     def add(
         self,
         t_us: NDArray[Any],
@@ -273,7 +301,7 @@ class FirstEventMap:
         y: NDArray[Any],
         on: NDArray[Any],
     ) -> None:
-        """Add events: equally long one-dimensional arrays of any integer type, *on* non-zero (or positive) for ON.
+        """Add events: equally long one-dimensional arrays of any integer type, *on* is 1 (or True) for ON.
 
         Arrays that are C-contiguous ``int64, uint16, uint16, uint8`` are not copied.
         """
@@ -288,13 +316,11 @@ class FirstEventMap:
         end_us = self._begin_us + MAX_INTERVAL_US
         if self._end_us is not None:
             end_us = min(end_us, self._end_us)
-        if on.dtype != np.uint8:
-            on = on > 0
         latch_first_on(
             t_us,
-            np.ascontiguousarray(x, np.uint16),
-            np.ascontiguousarray(y, np.uint16),
-            np.ascontiguousarray(on).view(np.uint8),
+            np.ascontiguousarray(x, dtype=np.uint16),
+            np.ascontiguousarray(y, dtype=np.uint16),
+            np.ascontiguousarray(on, dtype=np.uint8),
             self._begin_us,
             end_us,
             self.geometry.width,
