@@ -55,9 +55,7 @@ def believe(times, choice, slots, jitter):
             if len(fired) <= 2:
                 verdict, limit = UNFIRED, EMPTY
             else:
-                middle = fired[len(fired) // 2]
-                spread = sorted(abs(time - middle) for time in fired)[len(fired) // 2]
-                tolerance = 5.0 * max(1.4826 * spread, jitter * middle)
+                tolerance = 5.0 * jitter * fired[len(fired) // 2]
                 margin = 5.0 * jitter * own
                 n_early = sum(time <= own + margin for time in fired)
                 n_late = sum(time >= own - margin for time in fired) + silent

@@ -214,8 +214,8 @@ def temporal_image(
     valid = fired & (since_open_us > 0) & (passed > 0)
     if not valid.any():
         raise UsageError(
-            f"no pixel fired after the aperture began to open at {open_us} us "
-            f"({100 * first.fired_fraction:.2f} % fired before, which is noise); check the opening time and the profile"
+            f"no pixel fired together with its neighbours after the aperture began to open at {open_us} us; "
+            f"{100 * first.fired_fraction:.2f} % fired at all, which is noise; check the opening time and the profile"
         )
     log_intensity = np.zeros(first.times_us.shape, np.float32)
     log_intensity[valid] = -np.log(passed[valid])
