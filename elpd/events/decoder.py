@@ -1,7 +1,7 @@
 """The Python face of the word decoders: feed words, get arrays, in pieces of any size.
 
-One class serves EVT2, EVT2.1 and EVT3, because only the kernel and the word differ. It owns the registers and the output
-buffers; buffers grow to the largest piece seen and are then reused, so that a steady stream allocates nothing.
+One class serves EVT2, EVT2.1 and EVT3, because only the kernel and the word differ. It owns the registers and the
+output buffers; buffers grow to the largest piece seen and are then reused, so that a steady stream allocates nothing.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
 """EVT2 (32-bit words) and EVT2.1 (64-bit words) to events.
 
-Both carry the address and the low six bits of time in every event word and the upper 28 bits in TIME_HIGH, so time wraps
-at 2^34 us (4.77 h); a high part that falls by half its range or more is a wrap. EVT2.1 names up to 32 pixels of a row by
-a bit mask. Its words exist in two orders: as documented, and with the two 32-bit halves exchanged ("legacy", what an
-IMX636 sends); readers and drivers put the halves right before anything else sees them (``swap_halves``).
+Both carry the address and the low six bits of time in every event word and the upper 28 bits in TIME_HIGH, so time
+wraps at 2^34 us (4.77 h); a high part that falls by half its range or more is a wrap. EVT2.1 names up to 32 pixels of
+a row by a bit mask. Its words exist in two orders: as documented, and with the two 32-bit halves exchanged ("legacy",
+what an IMX636 sends); readers and drivers put the halves right before anything else sees them (``swap_halves``).
 
-As with EVT3: everything before the first TIME_HIGH is dropped, pixels outside the sensor and reserved words are counted
-and skipped, and nothing in a stream can raise or move an access outside the arrays.
+As with EVT3: everything before the first TIME_HIGH is dropped, pixels outside the sensor and reserved words are
+counted and skipped, and nothing in a stream can raise or move an access outside the arrays.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -93,7 +93,7 @@ def take_rare_evt2_word(word: int, t: int, state: NDArray[np.int64], triggers: N
 
 
 @kernel()
-def take_rare_evt21_word(  # noqa: D417
+def take_rare_evt21_word(
     kind: int, upper: int, lower: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]
 ) -> None:
     """Account for a word, given as its halves, that is neither an event nor TIME_HIGH."""

@@ -1,9 +1,9 @@
 """The registers of a word decoder: one int64 array that the caller owns.
 
-Prophesee's encodings are programs for a small machine with registers for time, row, vector base and polarity: most words
-set a register, few are events. Keeping the machine's registers and its tally of oddities in one flat array lets a stream
-be cut between any two words, lets decoding kernels and fused kernels share helpers, and costs a single argument.
-EVT2 and EVT2.1 use the time registers and the tallies alone.
+Prophesee's encodings are programs for a small machine with registers for time, row, vector base and polarity: most
+words set a register, few are events. Keeping the machine's registers and its tally of oddities in one flat array lets
+a stream be cut between any two words, lets decoding kernels and fused kernels share helpers, and costs a single
+argument. EVT2 and EVT2.1 use the time registers and the tallies alone.
 """
 
 from __future__ import annotations
