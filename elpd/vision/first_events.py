@@ -23,10 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
-from elpd.events.evt2 import Evt2Decoder, Evt21Decoder
-from elpd.events.evt3 import Evt3Decoder
 from elpd.events.jit import kernel
 from elpd.events.layout import event_columns
+from elpd.events.stream import DECODERS
 from elpd.records import Encoding
 
 if TYPE_CHECKING:
@@ -34,12 +33,6 @@ if TYPE_CHECKING:
 
     from elpd.events.decoder import WordDecoder
     from elpd.records import CameraPacket, Geometry
-
-DECODERS: dict[Encoding, type[Evt2Decoder | Evt21Decoder | Evt3Decoder]] = {
-    Encoding.EVT2: Evt2Decoder,
-    Encoding.EVT21: Evt21Decoder,
-    Encoding.EVT3: Evt3Decoder,
-}
 
 SLOTS = 3
 """ON times kept per pixel. At 5 Hz of noise, 100 ms of waiting exhausts them in 1.4 % of the pixels."""
@@ -55,8 +48,8 @@ SUPPORT = 2
 TOLERANCE_SIGMA = 5.0
 """How much earlier than its supporters a pixel may be, in standard deviations of the jitter."""
 
-MIN_JITTER = 0.02
-"""No sensor's contrast thresholds match better than this; keeps noiseless simulations from rejecting fine detail."""
+MIN_JITTER = 0.002
+"""A floor for simulations without mismatch. Low, because times count from the interval's begin, not the opening."""
 
 NORMAL_QUARTILE = 0.3186
 """A quarter of normal deviates are smaller than this in magnitude."""
