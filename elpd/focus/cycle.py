@@ -4,9 +4,9 @@ The cycle is a straight line read from top to bottom. A phase that finds out tha
 ``_Ended`` with an outcome and a sentence for the person; broken machinery leaves as ``DeviceError`` after the strongest
 stop has been sent. Either way the lens ends at a declared place or at rest, and there is exactly one result.
 
-The lens is not left where it stopped: the stop comes late by physics (a pixel must travel its leftover threshold and one
-more before it can flip, and motors brake), so the cycle looks up where focus *was* and goes back there, from the side
-the sweep came from, because backlash is invisible in read-back.
+The lens is not left where it stopped: the stop comes late by physics (a pixel must travel its leftover threshold and
+one more before it can flip, and motors brake), so the cycle looks up where focus *was* and goes back there, from the
+side the sweep came from, because backlash is invisible in read-back.
 """
 
 from __future__ import annotations
