@@ -2,8 +2,8 @@
 
 A camera stamps events with its own microseconds; commands to the lens are stamped with the host's nanoseconds. What
 ties them together is that a packet cannot arrive before its last event happened: over many packets the *smallest* delay
-seen is the shortest path, and every larger one is queueing. So the offset is tracked by its minimum (Klipper's clocksync
-and NTP's clock filter use the same idea), inside a sliding window so that slow drift is followed. The shortest path
+seen is the shortest path, every larger one is queueing. So the offset is tracked by its minimum (Klipper's clocksync
+and NTP use the same idea), inside a sliding window so that slow drift is followed. The shortest path
 itself cannot be seen from one side; it is a number of the camera (``Latency.min_latency_us``) or of a calibration.
 """
 
