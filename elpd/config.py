@@ -75,6 +75,8 @@ class JournalSection(_Section):
     directory: Path = Path("runs")
     enabled: bool = True
     keep: Annotated[int, Field(ge=1)] = 50
+    memory_mb: Positive = 256.0
+    """How much may wait in memory while the lens moves; past it the run's journal ends, marked truncated."""
 
 
 class SimSection(_Section):
