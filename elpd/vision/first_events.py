@@ -24,14 +24,11 @@ import numpy as np
 
 from elpd.errors import UsageError
 from elpd.events.jit import kernel
-from elpd.events.layout import event_columns
-from elpd.events.stream import DECODERS
-from elpd.records import Encoding
+from elpd.events.stream import PacketDecoder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.events.decoder import WordDecoder
     from elpd.records import CameraPacket, Geometry
 
 SLOTS = 3
@@ -242,7 +239,7 @@ class FirstEventMap:
         self._slots = np.full((SLOTS, geometry.height, geometry.width), EMPTY, np.int32)
         self._before = np.zeros((geometry.height, geometry.width), np.uint16)
         self._tally = np.zeros(4, np.int64)
-        self._decoder: WordDecoder | None = None
+        self._decoder: PacketDecoder | None = None
         self.first_us: int | None = None
         self.last_us: int | None = None
 
@@ -277,14 +274,10 @@ class FirstEventMap:
         Words are decoded here, with the decoder's state carried from packet to packet: times are those of the stream
         since its first packet *here*. Who has a decoder of the stream already gives its arrays to ``add`` instead.
         """
-        if packet.encoding is Encoding.ARRAY:
-            self.add(*event_columns(packet.data))
-            return
         if self._decoder is None:
-            self._decoder = DECODERS[packet.encoding](self.geometry)
-        if packet.gap_before:
-            self._decoder.forget_addresses()
-        self.add(*self._decoder.feed(packet.data))
+            self._decoder = PacketDecoder(self.geometry)
+        events = self._decoder.feed(packet)
+        self.add(events.t, events.x, events.y, events.p)
 
     def add(
         self,
