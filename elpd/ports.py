@@ -153,6 +153,14 @@ class Aperture(Protocol):
         ...
 
 
+class RunSink(Protocol):
+    """Where a cycle's notes go: phases, samples, verdicts, the result. Must not block and must not raise."""
+
+    def note(self, event: str, /, **fields: Any) -> None:
+        """Take one note. Fields are plain numbers, strings, booleans, ``None``, and lists or dicts of them."""
+        ...
+
+
 # --- optional abilities ------------------------------------------------------------------------------------------
 
 

@@ -1,17 +1,17 @@
 """EVT2 (32-bit words) and EVT2.1 (64-bit words) to events.
 
-Both carry the address and the low six bits of time in every event word and the upper 28 bits in TIME_HIGH, so time wraps
-at 2^34 us (4.77 h); a high part that falls by half its range or more is a wrap. EVT2.1 names up to 32 pixels of a row by
-a bit mask. Its words exist in two orders: as documented, and with the two 32-bit halves exchanged ("legacy", what an
-IMX636 sends); readers and drivers put the halves right before anything else sees them (``swap_halves``).
+Both carry the address and the low six bits of time in every event word and the upper 28 bits in TIME_HIGH, so time
+wraps at 2^34 us (4.77 h); a high part that falls by half its range or more is a wrap. EVT2.1 names up to 32 pixels of
+a row by a bit mask. Its words exist in two orders: as documented, and with the two 32-bit halves exchanged ("legacy",
+what an IMX636 sends); readers and drivers put the halves right before anything else sees them (``swap_halves``).
 
-As with EVT3: everything before the first TIME_HIGH is dropped, pixels outside the sensor and reserved words are counted
-and skipped, and nothing in a stream can raise or move an access outside the arrays.
+As with EVT3: everything before the first TIME_HIGH is dropped, pixels outside the sensor and reserved words are
+counted and skipped, and nothing in a stream can raise or move an access outside the arrays.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from elpd.events.registers import (
     RESERVED,
     X_OUT_OF_RANGE,
     Y_OUT_OF_RANGE,
+    Integer,
     hold_trigger,
 )
 
@@ -69,7 +70,7 @@ def swap_halves(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 @kernel()
-def take_time_high(content: int, state: NDArray[np.int64]) -> None:
+def take_time_high(content: Integer, state: NDArray[np.int64]) -> None:
     """Set the upper part of time; a repeated one changes nothing."""
     high = state[HIGH]
     if content != high:
@@ -80,11 +81,10 @@ def take_time_high(content: int, state: NDArray[np.int64]) -> None:
 
 
 @kernel()
-def take_rare_evt2_word(word: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
+def take_rare_evt2_word(word: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
     """Account for a word that is neither an event nor TIME_HIGH. *t* is its time, where it has one."""
     kind = word >> 28
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (word >> 8) & 0x1F, word & 1, state, triggers)
     elif kind in (0xE, 0xF):
         state[OTHERS] += 1
@@ -93,17 +93,15 @@ def take_rare_evt2_word(word: int, t: int, state: NDArray[np.int64], triggers: N
 
 
 @kernel()
-def take_rare_evt21_word(  # noqa: D417
-    kind: int, upper: int, lower: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]
+def take_rare_evt21_word(
+    kind: Integer, upper: Integer, lower: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]
 ) -> None:
     """Account for a word, given as its halves, that is neither an event nor TIME_HIGH."""
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (upper >> 8) & 0x1F, upper & 1, state, triggers)
     elif kind == 0xE:
         subtype = upper & 0xFFFF
         if subtype in (COUNT_BEFORE_CONTROLLER, COUNT_AFTER_CONTROLLER):
-            state[LOW] = t & 0x3F
             state[RATE_BEFORE if subtype == COUNT_BEFORE_CONTROLLER else RATE_AFTER] += lower & COUNT_MASK
             state[RATE_COUNTS] += 1
         else:

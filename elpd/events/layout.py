@@ -105,7 +105,12 @@ def _check_integer(name: str, dtype: np.dtype[Any]) -> None:
 
 def _as(array: NDArray[Any], views: dict[str, str], wide: np.dtype[Any]) -> NDArray[Any]:
     view = views.get(array.dtype.str[1:]) if array.dtype.isnative else None
-    return array.astype(wide) if view is None else array.view(view)
+    if view is not None:
+        return array.view(view)
+    if wide.itemsize == 2 and array.dtype.itemsize > 2:
+        # An address that two bytes cannot say must not wrap into the sensor.
+        return np.where((array < 0) | (array > 0xFFFF), 0xFFFF, array).astype(wide)
+    return array.astype(wide)
 
 
 def _low_byte(p: NDArray[Any]) -> NDArray[np.uint8]:

@@ -1,13 +1,13 @@
 """The Event Laplacian Product, window by window, straight from what a camera delivers.
 
-ELP is linear in the events: ``ELP = -Σ p·w(x, y)`` with p = ±1 and w the Laplacian of the reference (the paper's
-eq. for the product of event frame and image Laplacian, summed the other way round). So no event frame is built: each
-event is one table look-up and one add, and for raw words decoding and summing are one pass. All sums are exact integers:
-they do not depend on how the stream was cut into packets.
+ELP is linear in the events: ``ELP = -Σ p·w(x, y)`` with p = ±1 and w the Laplacian of the reference (the paper's eq.
+for the product of event frame and image Laplacian, summed the other way round). So no event frame is built: each
+event is one table look-up and one add, and for raw words decoding and summing are one pass. All sums are exact
+integers: they do not depend on how the stream was cut into packets.
 
-``ElpWindows`` is the one user-facing object. It holds the decoder's registers, the open window and the weight table, and
-hands a packet to the kernel of its encoding. It knows windows only as an ascending list of edge times; whether those are
-even in time or in travel of the lens is for its caller to say.
+``ElpWindows`` is the one user-facing object. It holds the decoder's registers, the open window and the weight table,
+and hands a packet to the kernel of its encoding. It knows windows only as an ascending list of edge times; whether
+those are even in time or in travel of the lens is for its caller to say.
 """
 
 from __future__ import annotations
@@ -144,6 +144,16 @@ class ElpWindows:
             )
         self._append(edges)
 
+    def set_weights(self, weights: NDArray[Any], inside: NDArray[np.bool_] | None = None) -> None:
+        """Weigh events by another reference from now on; the open window goes on.
+
+        Raises ``UsageError`` as the constructor does, and for a sensor of another size.
+        """
+        table = weight_table(weights, inside)
+        if table.shape != self._table.shape:
+            raise UsageError(f"the new weights of {weights.shape} are for another sensor; make a new ElpWindows")
+        self._table = table
+
     def feed(self, packet: CameraPacket) -> NDArray[Any]:
         """Sum a packet; return the windows it closed.
 
@@ -186,7 +196,7 @@ class ElpWindows:
         *,
         complete_until_us: int = NEVER,
     ) -> NDArray[Any]:
-        """Sum events given as columns, t int64 or uint32, of any stride; return the windows closed, as ``feed`` does."""
+        """Sum events given as columns of any stride, t int64 or uint32; return the windows closed, as ``feed``."""
         window = self._window
         window[N_ROWS] = 0
         position = self._arrays(

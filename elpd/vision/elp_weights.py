@@ -1,9 +1,9 @@
 """The weight table that an event's address indexes.
 
-``ELP = -Σ p·∇²I(x, y)`` (the paper's Event Laplacian Product) is one look-up and one add per event. The table is int16
-and flat, its rows wider than any 11-bit column and its last row empty, so that no word whatever can read outside of it.
-Membership is in the table too: a pixel outside the region carries a value that no weight has, which makes any shape of
-region, and a mask of hot pixels, cost the same as a rectangle.
+``ELP = -Σ p·∇²I(x, y)`` (the paper's Event Laplacian Product) is one look-up and one add per event. The table is
+int16 and flat, its rows wider than any 11-bit column and its last row empty, so that no word whatever can read
+outside of it. Membership is in the table too: a pixel outside the region carries a value that no weight has, which
+makes any shape of region, and a mask of hot pixels, cost the same as a rectangle.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def weight_table(weights: NDArray[Any], inside: NDArray[np.bool_] | None = None)
         inside = np.ones(weights.shape, np.bool_)
     if inside.shape != weights.shape or not inside.any():
         raise UsageError(
-            f"the region of shape {inside.shape} with {int(inside.sum())} pixels does not fit weights of {weights.shape}"
+            f"a region of shape {inside.shape} with {int(inside.sum())} pixels does not fit weights of {weights.shape}"
         )
     largest = int(np.abs(weights[inside].astype(np.int64)).max())
     if largest > MAX_WEIGHT:
