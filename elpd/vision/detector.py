@@ -88,12 +88,12 @@ class Detector:
     def overdispersion(self) -> float:
         """How much larger the scatter of successive windows is than that of independent events; at least one.
 
-        Two standard errors are added: a few windows that happen to agree prove little.
+        A standard error is added: a few windows that happen to agree prove little.
         """
         variance = sum(energy for _, energy in self._differences)
         if variance <= 0.0:
             return self.rest.overdispersion
-        doubt = 1.0 + 2.0 * float(np.sqrt(2.0 / len(self._differences)))
+        doubt = 1.0 + float(np.sqrt(2.0 / len(self._differences)))
         measured = doubt * sum(square for square, _ in self._differences) / variance
         return max(1.0, self.rest.overdispersion, measured)
 
