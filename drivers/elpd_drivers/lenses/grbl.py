@@ -105,7 +105,7 @@ class GrblLens:
         self._sampled_from_ns = 0
         self._unanswered_since_ns: int | None = None
         self._next_query_ns = 0
-        self._read_ns = 0
+        self._read_ns = self._line_begun_ns = self._line_end_ns = 0
         self._unacknowledged: deque[int | None] = deque()
         self._status: Status | None = None
         self._report: LensReport | None = None
@@ -339,14 +339,20 @@ class GrblLens:
         newest = None
         for line, bytes_after in self._lines.feed(data):
             # when the line's first byte can have left the board, at the latest
-            begun = now - (len(line) + 2 + bytes_after) * self._byte_ns
+            length_ns = (len(line) + 2) * self._byte_ns
+            begun = now - length_ns - bytes_after * self._byte_ns
             if line.startswith("<"):
                 status = parse_status(line)
                 newest = (self._take_status(status, begun, fuse=fuse) if status else None) or newest
             elif line == "ok":
-                self._acknowledged(before, begun)
+                # not before the last look at the port, unless it had to wait behind the line before it
+                earliest = before - length_ns
+                if earliest < self._line_end_ns:
+                    earliest = self._line_begun_ns
+                self._acknowledged(earliest, begun)
             else:
                 self._heed(line)
+            self._line_begun_ns, self._line_end_ns = begun, begun + length_ns
         return newest
 
     def _acknowledged(self, earliest: int, latest: int) -> None:
@@ -358,8 +364,9 @@ class GrblLens:
             return
         width = max(latest - earliest, 0)
         with self._lock:
-            sigma_ns = max(width / 12**0.5, 100 * NS_PER_US)
-            self._trajectory.amend(number, latest - min(width, 4 * NS_PER_MS) // 2, sigma_ns)
+            self._trajectory.amend(number, latest - width // 2, max(width / 12**0.5, 100 * NS_PER_US))
+            if not self._stopping:
+                self._rest_due_ns = (self._trajectory.at_rest_from() or latest) + 100 * NS_PER_MS
         if self._stopping:
             self._port.write(CANCEL)  # the first one may have come before there was anything to cancel
 
@@ -482,7 +489,8 @@ class GrblLens:
     def _ask(self, line: str, beginning: str) -> list[str]:
         """Send a line and collect the lines that begin so, up to its ``ok``."""
         self._port.write(f"{line}\n".encode("ascii"))
-        due, answers = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms), []
+        due = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms)
+        answers: list[str] = []
         while True:
             for got, _ in self._lines.feed(self._port.read_available()):
                 if got == "ok":
@@ -519,14 +527,12 @@ class GrblLens:
             )
         max_um = travel_mm * 1000 if table.max_um is None else table.max_um
         speed_um_s = board[110] / 60 * 1000
-        for name, wanted, number, has in (
+        for name, wanted, code, has in (
             ("max_um", max_um, 130, travel_mm * 1000),
             ("max_speed_um_s", table.max_speed_um_s or speed_um_s, 110, speed_um_s),
         ):
             if wanted > has * (1 + 1e-6):
-                raise ConfigError(
-                    f"lens.{name} is {wanted:g}, the board's ${number} allows {has:g}; change one of them"
-                )
+                raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${code} allows {has:g}; change one of them")
         acceleration = board[120] * 1000
         if table.acceleration_um_s2 is not None and abs(table.acceleration_um_s2 / acceleration - 1) > 1e-3:
             raise ConfigError(
@@ -542,7 +548,7 @@ class GrblLens:
         quantum = 0.001 * self._steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
         return Trajectory(
-            Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum_steps=quantum, rest_quantum_steps=quantum),
+            Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum, rest_quantum_steps=quantum, ramp_steps=1.5),
             floor_steps=0.3,
         )
 
