@@ -1,4 +1,4 @@
-"""A whole simulated rig: the entry point ``elpd.rigs: sim``, wired by hand.
+"""A simulated rig, whole, wired by hand: the entry point ``elpd.rigs: sim``.
 
 One world holds a camera, an aperture and a lens behind its real wire protocol; the driver that moves the lens is the one
 for real hardware. True focus is drawn over the lens's travel, and the lens begins referenced and at rest beside it.
