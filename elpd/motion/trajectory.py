@@ -216,6 +216,7 @@ class _Epoch:
     p_od: float = 0.0
     p_dd: float = 0.0
     reports: list[LensReport] = field(default_factory=list)
+    number: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +248,7 @@ class Trajectory:
         self._floor_variance = floor_steps * floor_steps
         self._history_ns = round(history_s * NS_PER_S)
         self._epochs: list[_Epoch] = []
+        self._commands = 0
 
     @property
     def known(self) -> bool:
@@ -262,19 +264,36 @@ class Trajectory:
         self._lay(epoch)
         self._epochs = [epoch]
 
-    def command(self, motion: Motion, effective_ns: int, sigma_ns: float) -> None:
-        """Note that *motion* takes over at *effective_ns*, give or take *sigma_ns*.
+    def command(self, motion: Motion, effective_ns: int, sigma_ns: float) -> int:
+        """Note that *motion* takes over at *effective_ns*, give or take *sigma_ns*; return a number to amend it by.
 
         Commands that were to take effect later than this one are superseded. Does nothing before the first report.
         """
+        self._commands += 1
         if not self._epochs:
-            return
+            return self._commands
         while len(self._epochs) > 1 and self._epochs[-1].begin_ns >= effective_ns:
             self._epochs.pop()
         epoch = _Epoch(max(effective_ns, self._epochs[-1].begin_ns), motion, sigma_ns / NS_PER_S)
+        epoch.number = self._commands
         self._epochs.append(epoch)
         self._follow(len(self._epochs) - 1)
         self._forget(epoch.begin_ns - self._history_ns)
+        return self._commands
+
+    def amend(self, number: int, effective_ns: int, sigma_ns: float) -> None:
+        """Learn when the command *number* truly took effect (its acknowledgement came). Unknown numbers are ignored."""
+        for index in range(1, len(self._epochs)):
+            epoch = self._epochs[index]
+            if epoch.number != number:
+                continue
+            after = self._epochs[index + 1].begin_ns if index + 1 < len(self._epochs) else effective_ns
+            epoch.begin_ns = min(max(effective_ns, self._epochs[index - 1].begin_ns), after)
+            epoch.delay_sigma_s = sigma_ns / NS_PER_S
+            self._sort_reports(index)
+            for later in range(index, len(self._epochs)):
+                self._follow(later)
+            return
 
     def expect(self, report: LensReport) -> Surprise:
         """Say how far *report* is from the model, without learning from it. Raises ``LensError`` before ``begin``."""
@@ -364,6 +383,18 @@ class Trajectory:
         self._lay(epoch)
         for report in epoch.reports:
             self._correct(epoch, report)
+
+    def _sort_reports(self, index: int) -> None:
+        """Give reports that turn out to be sampled before epoch *index* began to the one before it, which is laid out."""
+        before, epoch = self._epochs[index - 1], self._epochs[index]
+        kept = []
+        for report in epoch.reports:
+            if self._sampled(report)[0] < epoch.begin_ns:
+                before.reports.append(report)
+                self._correct(before, report)
+            else:
+                kept.append(report)
+        epoch.reports = kept
 
     def _lay(self, epoch: _Epoch) -> None:
         begin, steps, velocity, motion = epoch.begin_ns, epoch.steps, epoch.velocity_sps, epoch.motion
