@@ -7,7 +7,7 @@ and events may come in any order. Arrays are read where they lie, in whatever la
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from elpd.events.evt2 import (
     take_time_high,
 )
 from elpd.events.jit import kernel
-from elpd.events.registers import BEFORE_TIME, HIGH, LOOP, LOW, MAX_SIDE
+from elpd.events.registers import BEFORE_TIME, HIGH, LOOP, LOW, MAX_SIDE, Integer
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import (
     BEGIN,
@@ -56,10 +56,10 @@ ARRAYS_SIGNATURES = tuple(
 
 @kernel()
 def add_event(
-    t: int,
-    x: int,
-    y: int,
-    on: int,
+    t: Integer,
+    x: Integer,
+    y: Integer,
+    on: Integer,
     capped: bool,  # noqa: FBT001  (a constant of the caller)
     table: NDArray[np.int16],
     window: NDArray[np.int64],
@@ -106,7 +106,7 @@ def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compi
         outside = 0
         out_of_sensor = 0
         last_row = table.shape[0] // STRIDE - 1
-        t = np.int64(NEVER)
+        t: Any = np.int64(NEVER)
         while position < ts.shape[0]:
             t = np.int64(ts[position])
             if np.uint64(t - begin) >= length:
