@@ -6,14 +6,14 @@ import hashlib
 
 import numpy as np
 import pytest
+from elpd_drivers.sim.camera import CameraFaults
+from elpd_drivers.sim.world import BIRTH_NS, SLICE_NS, World, random_stream
 from sim_rigs import Ramp, Setup
 
 from elpd.errors import CameraError, ConfigError, UsageError
-from elpd.records import BiasSet, Encoding, Roi
 from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask
+from elpd.records import BiasSet, Encoding, Roi
 from elpd.units import HostNs
-from elpd_drivers.sim.camera import CameraFaults
-from elpd_drivers.sim.world import BIRTH_NS, SLICE_NS, World, random_stream
 
 
 class Diary:
@@ -116,7 +116,9 @@ def test_a_late_reader_sees_the_backlog_and_then_the_gap() -> None:
     delivered = sum(len(packet.data) for packet in packets)
     lost = sum(packet.lost_events for packet in packets)
     reference.camera.start()
-    everything = sum(len(p.data) for p in reference.packets(0.08) if p.complete_until_us <= packets[-1].complete_until_us)
+    everything = sum(
+        len(p.data) for p in reference.packets(0.08) if p.complete_until_us <= packets[-1].complete_until_us
+    )
     assert lost == packets[20].lost_events > 0
     assert delivered + lost == everything
 

@@ -6,17 +6,17 @@ import cv2
 import naive_sim
 import numpy as np
 import pytest
+from elpd_drivers.sim.aperture import SimulatedAperture
+from elpd_drivers.sim.motion import KINDS, SceneMotion
+from elpd_drivers.sim.optics import DARK, SIGMA0_PX, Condition, DefocusStack, blend_shifted, blur_ladder
+from elpd_drivers.sim.scene import FLOOR, NAMES, PICTURES, choose_scene, scene_canvas
+from elpd_drivers.sim.world import BIRTH_NS, World, random_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sim_rigs import MARGIN_PX, Ramp, Setup
 
 from elpd.errors import ConfigError
 from elpd.records import Roi
-from elpd_drivers.sim.aperture import SimulatedAperture
-from elpd_drivers.sim.motion import KINDS, SceneMotion
-from elpd_drivers.sim.optics import DARK, SIGMA0_PX, Condition, DefocusStack, blend_shifted, blur_ladder
-from elpd_drivers.sim.scene import FLOOR, NAMES, PICTURES, choose_scene, scene_canvas
-from elpd_drivers.sim.world import BIRTH_NS, World, random_stream
 
 
 @settings(max_examples=25, deadline=None)
@@ -105,7 +105,9 @@ def test_motion_has_the_stated_speed_and_stays_in_the_margin(kind: str, rms_px_s
 
 def test_motion_is_repeatable_and_static_is_still() -> None:
     a, b = (SceneMotion("shake", random_stream(2, "motion"), 29.0) for _ in range(2))
-    assert [a.displacement_px(t) for t in range(0, 50_000, 700)] == [b.displacement_px(t) for t in range(0, 50_000, 700)]
+    assert [a.displacement_px(t) for t in range(0, 50_000, 700)] == [
+        b.displacement_px(t) for t in range(0, 50_000, 700)
+    ]
     assert SceneMotion("static", random_stream(2, "motion"), 29.0).displacement_px(1e9) == (0.0, 0.0)
     with pytest.raises(ConfigError, match=", ".join(KINDS)):
         SceneMotion("wobble", random_stream(2, "motion"), 29.0)

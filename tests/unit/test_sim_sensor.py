@@ -5,14 +5,13 @@ from __future__ import annotations
 import naive_sim
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy_free import rank_correlation
-from sim_rigs import Ramp, Setup
-
-from elpd.records import BiasSet, Roi
 from elpd_drivers.sim.sensor import MISMATCH_STEP, EventSensor, fire_noise, sort_events, step_pixels
 from elpd_drivers.sim.world import random_stream
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sim_rigs import Ramp, Setup, rank_correlation
+
+from elpd.records import BiasSet, Roi
 
 F = np.float32
 QUIET = {"noise_hz": 0.0, "leak_hz": 0.0}
