@@ -190,7 +190,7 @@ def _raster(x: NDArray[np.int64], y: NDArray[np.int64], width: int, height: int)
     dots[y, x] = True
     if x.size > 1:
         dx, dy = np.diff(x), np.diff(y)
-        steps = np.maximum(np.abs(dx), np.abs(dy)) + 1
+        steps = np.maximum(np.abs(dx), np.abs(dy))
         segment = np.repeat(np.arange(steps.size), steps)
         along = (np.arange(segment.size) - np.repeat(np.cumsum(steps) - steps, steps)) / steps[segment]
         dots[
