@@ -82,7 +82,7 @@ def _verdicts(now: Conditions) -> Iterator[Verdict]:
             "check its cable, then clear the fault",
         )
     if now.cancelled:
-        yield Verdict(Action.CANCEL, Outcome.CANCELLED, "cancelled on request")
+        yield Verdict(Action.CANCEL, Outcome.CANCELLED, "cancelled on request; the lens was stopped")
     if now.ms_to_deadline <= 0:
         yield Verdict(
             Action.CANCEL, Outcome.DEADLINE, "the deadline passed before focus was found; raise focus.deadline_ms"

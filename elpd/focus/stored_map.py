@@ -93,6 +93,6 @@ def load(path: Path) -> StoredMap:
             position_um, made_unix_s = float(facts.pop("position_um")), float(facts.pop("made_unix_s"))
             facts["open_us"] = SensorUs(facts["open_us"])
             image = TemporalImage(log_intensity=data["log_intensity"], valid=data["valid"], **facts)
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: not a stored map ({error}); make a new one with `elpd expose`") from None
     return StoredMap(image, position_um, made_unix_s)

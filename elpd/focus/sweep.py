@@ -1,8 +1,8 @@
 """The hot loop: read, measure, decide, stop.
 
-One direction of travel at a time. ``Sweep.run`` returns as soon as one of three things is certain: focus has been passed
-(the stop command has left by then), focus lies behind, or a rule of ``safety`` ends it. The stop leaves before any
-bookkeeping; what the loop learned is read from the sweep afterwards.
+One direction of travel at a time. ``Sweep.run`` returns as soon as one of three things is certain: focus has been
+passed (the stop command has left by then), focus lies behind, or a rule of ``safety`` ends it. The stop leaves before
+any bookkeeping; what the loop learned is read from the sweep afterwards.
 """
 
 from __future__ import annotations
