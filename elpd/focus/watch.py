@@ -52,6 +52,9 @@ TICKS_PER_DEPTH_OF_FOCUS = 4
 LOOK_BACK_DOF = 12.0
 """The curve of sharpness is drawn this far back from the stop: a peak is five depths of focus wide."""
 
+FAR_DROP = 0.6
+"""How far down the far side of the peak the witnesses look, in log S: about as far as the flank this side."""
+
 SIGMAS_AFTER_REVERSAL = 9.0
 """A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
 
@@ -246,12 +249,9 @@ class Watch:
         track = self._draw(stretch)
         if track is None:
             return None
+        peak_um, end_um = track.positions[track.peak], self._far_side(track)
         said = ask_events(
-            stretch,
-            track.positions[track.flank(FLANK)],
-            track.positions[track.peak],
-            track.positions[-1],
-            self._brightness(),
+            _until(stretch, end_um), track.positions[track.flank(FLANK)], peak_um, end_um, self._brightness()
         )
         unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
         found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um)])
@@ -383,6 +383,15 @@ class Watch:
             track.add(int(stretch.t_us[max(0, taken - 1)]), float(tick_um), energy.measure())
         return track if track.positions[track.peak] > track.positions[track.flank(FLANK)] else None
 
+    @staticmethod
+    def _far_side(track: PeakTrack) -> float:
+        """Return where the far side of the peak has said enough: what comes later only blurs the answer."""
+        top = track.values[track.peak]
+        for value, position in zip(track.values[track.peak :], track.positions[track.peak :], strict=True):
+            if value < top - FAR_DROP:
+                return position
+        return track.positions[-1]
+
     def _ask_frames(self) -> list[Witness]:
         """Ask the frames of this sweep, where three or more saw focus come and go."""
         track = PeakTrack()
@@ -401,3 +410,16 @@ class Watch:
         right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         return np.ascontiguousarray(self._reference.brightness[top:bottom, left:right])
+
+
+def _until(stretch: EventStretch, end_um: float) -> EventStretch:
+    """Cut a stretch off at a position."""
+    count = int(np.searchsorted(stretch.position, end_um, side="right"))
+    return replace(
+        stretch,
+        t_us=stretch.t_us[:count],
+        x=stretch.x[:count],
+        y=stretch.y[:count],
+        on=stretch.on[:count],
+        position=stretch.position[:count],
+    )
