@@ -1,10 +1,14 @@
 """Word streams to test with: every kind of word, sense and nonsense, and places to cut them."""
 
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+
+from elpd.events.stream import EventStream, open_recording
 
 sizes = st.integers(1, 70)
 cuts = st.lists(st.integers(0, 300), max_size=6)
@@ -40,3 +44,15 @@ def evt21_words() -> Any:
 def pieces(words: Any, cuts: list[int]) -> list[NDArray[Any]]:
     """Cut an array at any places."""
     return np.split(words, sorted(cut % (len(words) + 1) for cut in cuts))
+
+
+def opened(path: Path) -> Any:
+    """Open a recording for a ``with`` block."""
+    return closing(open_recording(path))
+
+
+def read_columns(path: Path, max_bytes: int = 1 << 20) -> list[NDArray[Any]]:
+    """Read a recording through; return t, x, y, p."""
+    with opened(path) as reader:
+        chunks = [[column.copy() for column in chunk[:4]] for chunk in EventStream(reader).chunks(max_bytes)]
+    return [np.concatenate(column) for column in zip(*chunks, strict=True)]

@@ -168,7 +168,7 @@ def finish(
     complete_until_us: int,
 ) -> None:
     """Settle the count of late events and close what the caller's promise closes."""
-    t = np.int64(NEVER)
+    t: Any = np.int64(NEVER)
     if state[HIGH] >= 0:
         t = (((state[LOOP] << HIGH_BITS) + state[HIGH]) << LOW_BITS) + state[LOW]
     if max(t, complete_until_us) > NEVER:
