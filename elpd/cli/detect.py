@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--roi", "roi_text", metavar="X,Y,W,H", help="Where to focus; by default info.txt's region, or all.")
 @click.option("--frames", metavar="DIR|none", help="Folder of frames, relative to PATH, or none.")
-@click.option("--reference", "reference_path", type=click.Path(path_type=Path), help="An image that is there from the start.")
+@click.option(
+    "--reference", "reference_path", type=click.Path(path_type=Path), help="An image that is there from the start."
+)
 @click.option("--aperture-us", "aperture_text", metavar="A,B", help="The aperture opened in this interval.")
 @click.option("--transmittance", default="linear", metavar="linear|iris|FILE", help="How it opened.")
 @click.option("--speed-um-s", type=float, help="Constant speed of the lens.")

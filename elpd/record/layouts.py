@@ -15,7 +15,6 @@ import re
 import zipfile
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from elpd.vision.reference import load_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -132,10 +132,11 @@ def _read_info(info: Path) -> _Info:
 def _frames_in(folder: Path) -> tuple[FrameFile, ...]:
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder of frames; give --frames DIR relative to the sweep, or none")
-    found = []
-    for entry in folder.iterdir():
-        if entry.suffix.lower() in _FRAME_SUFFIXES and entry.stem.isdigit():
-            found.append(FrameFile(int(entry.stem), entry))
+    found = [
+        FrameFile(int(entry.stem), entry)
+        for entry in folder.iterdir()
+        if entry.suffix.lower() in _FRAME_SUFFIXES and entry.stem.isdigit()
+    ]
     if not found:
         raise FormatError(f"{folder}: no frames named <microseconds>.jpg or .png; give --frames none to do without")
     return tuple(sorted(found, key=lambda frame: frame.t_us))
@@ -211,7 +212,9 @@ def _columns_of_recording(
         warnings = [str(one) for one in reader.notes.get("warnings", ())]
     finally:
         reader.close()
-    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in ("t", "x", "y", "p")} if pieces else {}
+    columns = (
+        {name: np.concatenate([piece[name] for piece in pieces]) for name in ("t", "x", "y", "p")} if pieces else {}
+    )
     return columns, geometry, warnings
 
 
@@ -241,7 +244,8 @@ def _assemble(
     outside = (x < 0) | (y < 0) | (x >= geometry.width) | (y >= geometry.height)
     if outside.any():
         raise FormatError(
-            f"{path}: {int(outside.sum())} of {x.size} events lie outside the sensor's {geometry.width}x{geometry.height}"
+            f"{path}: {int(outside.sum())} of {x.size} events lie outside "
+            f"the sensor's {geometry.width}x{geometry.height} pixels"
         )
     if (np.diff(t_us) < 0).any():
         order = np.argsort(t_us, kind="stable")
@@ -254,7 +258,9 @@ def _assemble(
         if chosen.fits(geometry):
             roi = chosen
         else:
-            notes.append(f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor; all of it used")
+            notes.append(
+                f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor, which is used whole"
+            )
     return RecordedSweep(
         t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), info.bin_us, tuple(notes)
     )

@@ -39,7 +39,19 @@ LONGEST_WINDOW_US = 1_000_000
     "void(int64[::1], uint16[::1], uint16[::1], uint8[::1], int16[:, ::1], int64, int64, int64, int64, "
     "int64[::1], int64[:, ::1])"
 )
-def sum_windows(t_us, x, y, on, weights, x0, y0, x1, y1, edges_us, sums):  # type: ignore[no-untyped-def]
+def sum_windows(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    weights: NDArray[np.int16],
+    x0: int,
+    y0: int,
+    x1: int,
+    y1: int,
+    edges_us: NDArray[np.int64],
+    sums: NDArray[np.int64],
+) -> None:
     """Add events to the windows between ascending *edges_us*; those outside edges or region are passed over.
 
     *sums*, (windows, 4) ``int64``, is added to: elp, energy, ON count, OFF count.
@@ -123,6 +135,7 @@ class WindowsByEvents:
     def edge_after(self, begin_us: int) -> int | None:
         """Return nothing: events decide."""
         del begin_us
+        return None
 
     @classmethod
     def for_roi(cls, roi: Roi) -> WindowsByEvents:
@@ -237,9 +250,7 @@ class Meter:
         if self.ruler is not None and self.ruler.in_um:
             position = self.ruler.position(0.5 * (self._begin_us + end_us))
             travel = abs(self.ruler.position(end_us) - self.ruler.position(self._begin_us))
-        sample = ElpSample(
-            SensorUs(self._begin_us), SensorUs(end_us), elp, energy, n_on, n_off, 0, position, travel
-        )
+        sample = ElpSample(SensorUs(self._begin_us), SensorUs(end_us), elp, energy, n_on, n_off, 0, position, travel)
         self._begin_us = end_us
         self._sums[:] = 0
         return sample
