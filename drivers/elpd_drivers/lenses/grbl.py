@@ -146,6 +146,12 @@ class GrblLens:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
         self._port.read_available()
         status = self._first_status()
+        due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
+        while status.state not in {"Idle", "Alarm"}:
+            # somebody else's motion; what a cancel does not end (a hold), a reset does
+            self._write(CANCEL if self._clock.now_ns() < due else RESET)
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 100))
+            status = self._first_status()
         version = self._ask("$I", "[VER:")
         if not any(line.startswith(_PORTS_OF_GRBL) for line in version):
             raise LensError(
@@ -154,9 +160,6 @@ class GrblLens:
             )
         self._take_board_settings(self._ask("$$", "$"))
         self._trajectory = self._new_trajectory()
-        if status.state not in {"Idle", "Alarm"}:
-            self._write(CANCEL)
-            status = self._await_idle(after_ms(self._clock.now_ns(), 1000))
         self._referenced = status.state == "Idle" and self._settings.trust_position and not self._resetting
         self._resetting = False
         due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
