@@ -112,7 +112,7 @@ class GrblLens:
         self._wish: _Wish | None = None
         self._cruise_sps = 0.0
         self._stopping = False
-        self._resetting = False
+        self._resetting = self._locked_by_stop = False
         self._referenced = False
         self._implausible = 0
         self._rest_due_ns: int | None = None
@@ -146,6 +146,12 @@ class GrblLens:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
         self._port.read_available()
         status = self._first_status()
+        due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
+        while status.state not in {"Idle", "Alarm"}:
+            # somebody else's motion; what a cancel does not end (a hold), a reset does
+            self._write(CANCEL if self._clock.now_ns() < due else RESET)
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 100))
+            status = self._first_status()
         version = self._ask("$I", "[VER:")
         if not any(line.startswith(_PORTS_OF_GRBL) for line in version):
             raise LensError(
@@ -154,9 +160,6 @@ class GrblLens:
             )
         self._take_board_settings(self._ask("$$", "$"))
         self._trajectory = self._new_trajectory()
-        if status.state not in {"Idle", "Alarm"}:
-            self._port.write(CANCEL)
-            status = self._await_idle(after_ms(self._clock.now_ns(), 1000))
         self._referenced = status.state == "Idle" and self._settings.trust_position and not self._resetting
         self._resetting = False
         due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
@@ -184,7 +187,7 @@ class GrblLens:
             raise self._trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
         with self._lock:
             self._trajectory.begin(report)
-        self._referenced = True
+        self._referenced, self._locked_by_stop = True, False
         return self._flagged(report)
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
@@ -207,9 +210,9 @@ class GrblLens:
         self._wish = None
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
-            self._resetting = True
+            self._resetting = self._locked_by_stop = True
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         with self._lock:
             self._note_stop(mode, begun)
@@ -275,7 +278,7 @@ class GrblLens:
             number = self._trajectory.command(motion, effective, 2 * NS_PER_MS)
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 100 * NS_PER_MS
         self._unacknowledged.append(number)
-        self._port.write(line)
+        self._write(line)
         self._cruise_sps, self._stopping, self._stops_ignored = wish.speed_sps, False, 0
         return CommandStamp(name, begun, self._clock.now_ns())
 
@@ -319,7 +322,7 @@ class GrblLens:
                 )
         lost = self._query_ns is not None and now - self._query_ns > self._settings.reply_ms * NS_PER_MS / 3
         if lost or (self._query_ns is None and now >= self._next_query_ns):
-            self._port.write(STATUS)
+            self._write(STATUS)
             with self._lock:
                 self._sampled_from_ns = self._on_wire(1, now)
             self._query_ns = now
@@ -330,10 +333,7 @@ class GrblLens:
 
     def _take_lines(self, *, fuse: bool) -> LensReport | None:
         """Read and act on every complete line; return the newest report."""
-        try:
-            data = self._port.read_available()
-        except LensError as error:
-            raise self._trouble(str(error).removeprefix("lens: ")) from None
+        data = self._read()
         before, now = self._read_ns, self._clock.now_ns()
         self._read_ns = now
         newest = None
@@ -368,7 +368,7 @@ class GrblLens:
             if not self._stopping:
                 self._rest_due_ns = (self._trajectory.at_rest_from() or latest) + 100 * NS_PER_MS
         if self._stopping:
-            self._port.write(CANCEL)  # the first one may have come before there was anything to cancel
+            self._write(CANCEL)  # the first one may have come before there was anything to cancel
 
     def _heed(self, line: str) -> None:
         """Act on what the board says by itself."""
@@ -390,7 +390,7 @@ class GrblLens:
         if self._query_ns is None:
             return None  # late or duplicate: its instant of sampling is unknown
         self._query_ns = None
-        if status.state == "Alarm" and self._busy() and not self._resetting and not self._unacknowledged:
+        if status.state == "Alarm" and self._busy() and not self._locked_by_stop and not self._unacknowledged:
             raise self._trouble("GRBL fell into Alarm during a motion; clear the cause, home")
         moving = status.state in {"Jog", "Run", "Home", "Hold:1"}
         velocity = None if moving else 0.0
@@ -446,7 +446,7 @@ class GrblLens:
         self._stops_ignored += 1
         if self._stops_ignored > 3:
             raise self._trouble(f"the motor still runs after {self._stops_ignored - 1} stops; the board was reset")
-        self._port.write(CANCEL)
+        self._write(CANCEL)
         self._stopping = True
 
     def _flagged(self, report: LensReport) -> LensReport:
@@ -468,10 +468,10 @@ class GrblLens:
         while True:
             now = self._clock.now_ns()
             if reset_at is not None and now >= reset_at:
-                self._port.write(RESET)
+                self._write(RESET)
                 self._resetting, reset_at = True, due
             if now >= ask_at:
-                self._port.write(STATUS)
+                self._write(STATUS)
                 ask_at = after_ms(now, 100)
             for line, _ in self._lines.feed(self._port.read_available()):
                 status = parse_status(line)
@@ -488,7 +488,7 @@ class GrblLens:
 
     def _ask(self, line: str, beginning: str) -> list[str]:
         """Send a line and collect the lines that begin so, up to its ``ok``."""
-        self._port.write(f"{line}\n".encode("ascii"))
+        self._write(f"{line}\n".encode("ascii"))
         due = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms)
         answers: list[str] = []
         while True:
@@ -565,7 +565,7 @@ class GrblLens:
         with self._lock:
             self._on_wire(len(line), self._clock.now_ns())
         self._unacknowledged.append(number)
-        self._port.write(line)
+        self._write(line)
 
     def _on_wire(self, count: int, begun: int) -> int:
         """Return when the last of *count* bytes written at *begun* leaves the wire, behind those before it."""
@@ -578,6 +578,26 @@ class GrblLens:
             raise self._trouble(why)
         self._clock.sleep_until(after_ms(now, 1))
 
+    def _write(self, data: bytes) -> None:
+        """Write, or latch that the line is dead."""
+        try:
+            self._port.write(data)
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _read(self) -> bytes:
+        """Read what has come, or latch that the line is dead."""
+        try:
+            return self._port.read_available()
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+        self._referenced = False
+
     def _check_fault(self) -> None:
         if self._fault is not None:
             raise LensError(self._fault)
@@ -588,6 +608,6 @@ class GrblLens:
             self._port.write(RESET)
         except LensError as error:
             what = f"{what} (and the reset could not be written: {error})"
-        self._fault = f"lens: {what}"
-        self._referenced, self._wish = False, None
+        self._wish = None
+        self._latch(f"lens: {what}")
         return LensError(self._fault)

@@ -77,6 +77,7 @@ _LONG = frozenset({0xE0, 0xE3, 0xE5, 0xE6, 0xE9, 0xEA, 0xEC})
 _BLOCK = frozenset({0xA1, 0xA2, 0xA8})
 _CLEARS_SERIAL_ERROR = frozenset({0xE0, 0xE3, 0xEC, 0x89, 0x85, 0x83, 0xB0})
 _MAX_BLOCK = 15
+_ERROR = 0  # stands in the queue of commands for a frame that was none
 
 
 def crc7(data: bytes) -> int:
@@ -158,7 +159,7 @@ class TicBoard:
         for byte in data:
             if byte & 0x80:
                 if self._frame:
-                    self._serial_error(TicError.SERIAL_FORMAT)
+                    self._serial_error(TicError.SERIAL_FORMAT, at_ns)
                 self._frame = bytearray((byte,))
             elif self._frame:
                 self._frame.append(byte)
@@ -212,19 +213,25 @@ class TicBoard:
         length = _payload_length(command)
         if length is None:
             self._frame = bytearray()
-            self._serial_error(TicError.SERIAL_FORMAT)
+            self._serial_error(TicError.SERIAL_FORMAT, at_ns)
             return
         if len(frame) < header + length + self.config.crc_commands:
             return
         self._frame = bytearray()
         if self.config.crc_commands and crc7(bytes(frame[:-1])) != frame[-1]:
-            self._serial_error(TicError.SERIAL_CRC)
+            self._serial_error(TicError.SERIAL_CRC, at_ns)
             return
         if pololu and frame[1] != self.config.device_number:
             return
+        self._queue(command, bytes(frame[header : header + length]), at_ns)
+
+    def _queue(self, command: int, payload: bytes, at_ns: int) -> None:
+        """Let a command take effect after the firmware's latency, and never before an earlier one."""
         latency = self._random.randint(*self.config.latency_us) * 1000
-        due = max(at_ns + latency, self._pending[-1][0] if self._pending else 0)
-        self._pending.append((due, command, bytes(frame[header : header + length])))
+        self._pending.append((max(at_ns + latency, self._pending[-1][0] if self._pending else 0), command, payload))
+
+    def _serial_error(self, error: TicError, at_ns: int) -> None:
+        self._queue(_ERROR, int(error).to_bytes(4, "little"), at_ns)
 
     def _execute(self, command: int, payload: bytes, at_ns: int) -> None:
         if command in _CLEARS_SERIAL_ERROR:
@@ -232,10 +239,13 @@ class TicBoard:
         if command in _CLEARS_SERIAL_ERROR or command == 0x8C:
             self._errors &= ~TicError.COMMAND_TIMEOUT
             self._restart_timeout(at_ns)
-        if command in _BLOCK:
+        if command == _ERROR:
+            self._occurred |= TicError(int.from_bytes(payload, "little"))
+            self._raise_errors(TicError.SERIAL)
+        elif command in _BLOCK:
             self._answer(command, payload, at_ns)
         elif command in _LONG:
-            self._execute_long(command, _decode_long(payload), at_ns)
+            self._execute_long(command, decode_long(payload), at_ns)
         elif command in _SEVEN_BIT:
             self._execute_seven_bit(command, payload[0])
         else:
@@ -316,7 +326,7 @@ class TicBoard:
     def _halt(self, at_ns: int) -> None:
         self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
         self.lens.halt(at_ns)
-        self._watch_switches(at_ns)
+        self._switch_ns = None
 
     def _raise_errors(self, errors: TicError) -> None:
         """Note errors and give the soft response: decelerate to hold. Any error violates safe start, too."""
@@ -324,10 +334,6 @@ class TicBoard:
         self._occurred |= errors
         self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
         self._ramp(0.0, self._now_ns)
-
-    def _serial_error(self, error: TicError) -> None:
-        self._occurred |= error
-        self._raise_errors(TicError.SERIAL)
 
     def _acceleration_sps2(self) -> float:
         return self._max_acceleration * 1.0 / ACCELERATION_UNIT
@@ -411,7 +417,7 @@ class TicBoard:
     def _answer(self, command: int, payload: bytes, at_ns: int) -> None:
         offset, length = payload[0] | (payload[1] & 0x40) << 1, payload[1] & 0x3F
         if not 1 <= length <= _MAX_BLOCK:
-            self._serial_error(TicError.SERIAL_FORMAT)
+            self._serial_error(TicError.SERIAL_FORMAT, at_ns)
             return
         table = self._settings() if command == 0xA8 else self._variables(at_ns)
         answer = bytes(table[offset : offset + length].ljust(length, b"\0"))
@@ -513,7 +519,7 @@ def _payload_length(command: int) -> int | None:
     return 5 if command in _LONG else None
 
 
-def _decode_long(payload: bytes) -> int:
+def decode_long(payload: bytes) -> int:
     """Put the top bits, sent together in the first byte, back on their bytes."""
     raw = bytes(payload[1 + i] | ((payload[0] >> i) & 1) << 7 for i in range(4))
     return int.from_bytes(raw, "little", signed=True)
