@@ -24,7 +24,7 @@ def _state(seed: int, n: int, begin_us: int) -> dict[str, np.ndarray]:
         "target": level + rng.normal(0, 0.4, n).astype(F),
         "level": level,
         "reference": level + rng.uniform(-0.15, 0.15, n).astype(F),
-        "rate": rng.uniform(1 / 2000, 1 / 60, n).astype(F),
+        "gain": rng.uniform(0.05, 0.95, n).astype(F),
         "spread_on": rng.integers(0, 256, n).astype(np.uint8),
         "spread_off": rng.integers(0, 256, n).astype(np.uint8),
         "held": rng.integers(0, 2, n).astype(np.uint8),

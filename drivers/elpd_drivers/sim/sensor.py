@@ -68,7 +68,7 @@ def step_pixels(
     target: NDArray[np.float32],
     level: NDArray[np.float32],
     reference: NDArray[np.float32],
-    rate: NDArray[np.float32],
+    gain: NDArray[np.float32],
     spread_on: NDArray[np.uint8],
     spread_off: NDArray[np.uint8],
     held: NDArray[np.uint8],
@@ -87,10 +87,10 @@ def step_pixels(
     """Advance all pixels from *begin_us* to *end_us* and append their events; return the new count of events.
 
     ``target`` is the log photocurrent at *end_us*, ``level`` the photoreceptor's output (updated), ``reference`` the
-    comparator's (updated), ``rate`` the photoreceptor's bandwidth per us. A pixel whose ``held`` is 1 is in reset
-    until ``release_us``. Thresholds are ``c·(1 + spread·(q - 128))`` with q from ``spread_on`` or ``spread_off``.
-    Events beyond the capacity of the outputs are counted but not kept. The lag is the implicit Euler rule, whose
-    delay of a ramp is exactly the time constant whatever the step.
+    comparator's (updated), ``gain`` how much of the way to the target the photoreceptor goes in this step. A pixel
+    whose ``held`` is 1 is in reset until ``release_us``. Thresholds are ``c·(1 + spread·(q - 128))`` with q from
+    ``spread_on`` or ``spread_off``.
+    Events beyond the capacity of the outputs are counted but not kept.
     """
     capacity = out_t.shape[0]
     pixels = target.shape[0]
@@ -103,13 +103,12 @@ def step_pixels(
     eights = stirred.view(np.uint64)
     for start in range(0, pixels, BLOCK):
         stop = min(start + BLOCK, pixels)
-        goal, now, base_, speed = target[start:stop], level[start:stop], reference[start:stop], rate[start:stop]
+        goal, now, base_, part = target[start:stop], level[start:stop], reference[start:stop], gain[start:stop]
         q_on, q_off, reset = spread_on[start:stop], spread_off[start:stop], held[start:stop]
         for k in range(stop - start):
             old = now[k]
             before[k] = old
-            gain = step * speed[k]
-            new = old + (goal[k] - old) * (gain / (one + gain))
+            new = old + (goal[k] - old) * part[k]
             now[k] = new
             moved = new - base_[k]
             rises = moved >= on_base + on_slope * np.float32(q_on[k])
@@ -365,6 +364,7 @@ class EventSensor:
             np.exp(log_rows, out=rows)
             rows *= np.float32(1 / LAG_US_AT_FULL)
             np.maximum(rows, np.float32(1 / SLOWEST_LAG_US), out=rows)
+        self._gain_fits_us = 0
 
     def begin(self, begin_us: int, end_us: int) -> None:
         """Open a span of time; its steps follow in order, then ``finish``."""
@@ -390,8 +390,9 @@ class EventSensor:
     def step(self, target: NDArray[np.float32], begin_us: int, end_us: int) -> None:
         """Let the picture change evenly to *target* in a part of the span."""
         biases = self._biases
+        self._fit_gain(end_us - begin_us)
         self._count = step_pixels(
-            target.ravel(), self.level.ravel(), self._reference.ravel(), self._rate.ravel(),
+            target.ravel(), self.level.ravel(), self._reference.ravel(), self._gain.ravel(),
             self._window_on.ravel(), self._window_off.ravel(), self._held.ravel(), self._release_us.ravel(),
             np.float32(biases.c_on), np.float32(biases.c_off), np.float32(MISMATCH_STEP), biases.refractory_us,
             begin_us, end_us, self._count, self._out_t, self._out_pixel, self._out_on,
@@ -408,6 +409,16 @@ class EventSensor:
             self.window.x, self.window.y, np.empty(span_us + 1, np.int64), t, x, y, on,
         )  # fmt: skip
         return Events(t, x, y, on, self._count - kept)
+
+    def _fit_gain(self, step_us: int) -> None:
+        """Set the photoreceptors' gain for a step: implicit Euler, which delays a ramp by exactly the time constant."""
+        if self._gain_fits_us == step_us:
+            return
+        self._gain_fits_us = step_us
+        parts = max(1, self._rate.size // CACHED_PIXELS)
+        for rate, gain in zip(np.array_split(self._rate, parts), np.array_split(self._gain, parts), strict=True):
+            np.multiply(rate, np.float32(step_us), out=gain)
+            np.divide(gain, gain + np.float32(1), out=gain)
 
     def _noise_candidates(
         self, begin_us: int, end_us: int
@@ -440,6 +451,7 @@ class EventSensor:
         self.level = np.zeros(shape, np.float32)
         self._reference = np.zeros(shape, np.float32)
         self._rate = np.full(shape, 1 / SLOWEST_LAG_US, np.float32)
+        self._gain, self._gain_fits_us = np.empty(shape, np.float32), 0
         self._held = np.zeros(shape, np.uint8)
         self._release_us = np.zeros(shape, np.int64)
         self._entering = np.ones(shape, np.bool_)
