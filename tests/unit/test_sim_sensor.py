@@ -162,6 +162,28 @@ def test_first_on_events_of_an_opening_map_the_scene() -> None:
     assert per_pixel.mean() < 1.05
 
 
+def test_a_second_exposure_is_as_good_as_the_first() -> None:
+    setup = Setup(with_aperture=True, scene="camera", size=(160, 120))
+    setup.run(0.001)
+    spreads = []
+    for _ in range(2):
+        now_s = (setup.world.now_ns() - 1e9) / 1e9
+        setup.camera.apply_biases(BiasSet.EXPOSE)
+        setup.packets(now_s + 0.006)
+        setup.aperture.open()
+        events = setup.run(now_s + 0.040)
+        first = np.full((120, 160), np.nan)
+        true_on = events[events["on"] & (events["t"] > (setup.aperture.began_ns - 1e9) / 1e3)][::-1]
+        first[true_on["y"], true_on["x"]] = true_on["t"] - (setup.aperture.began_ns - 1e9) / 1e3
+        fired = np.isfinite(first)
+        spreads.append(rank_correlation(-first[fired], setup.canvas[32:-32, 32:-32][fired]))
+        assert fired.mean() > 0.97
+        setup.camera.apply_biases(BiasSet.FOCUS)
+        setup.aperture.close()
+        setup.packets(now_s + 0.1)
+    assert spreads[1] == pytest.approx(spreads[0], abs=0.005)
+
+
 def test_after_switching_biases_events_are_disordered_for_a_few_milliseconds() -> None:
     setup = Setup(sensor={"noise_hz": 1.0})
     setup.run(0.02)

@@ -37,8 +37,8 @@ MISMATCH_STEP = 0.00125
 BLOCK = 2048
 HOT_PIXEL_HZ = 2_000.0
 UNSETTLED_HZ = 60.0
-UNSETTLED_TAU_US = 1_000.0
-UNSETTLED_US = 4_000
+UNSETTLED_TAU_US = 700.0
+UNSETTLED_US = 3_000
 NEVER_US = 1 << 62
 CAPACITY_MARGIN = 1 << 16
 
@@ -105,56 +105,57 @@ def step_pixels(
         stop = min(start + BLOCK, pixels)
         goal, now, base_, part = target[start:stop], level[start:stop], reference[start:stop], gain[start:stop]
         q_on, q_off, reset = spread_on[start:stop], spread_off[start:stop], held[start:stop]
+        # Loops of few arrays each: the compiler gives up on vector code where it would have to prove many apart.
+        before[: stop - start] = now
         for k in range(stop - start):
-            old = now[k]
-            before[k] = old
-            new = old + (goal[k] - old) * part[k]
-            now[k] = new
-            moved = new - base_[k]
+            now[k] = before[k] + (goal[k] - before[k]) * part[k]
+        for k in range(stop - start):
+            moved = now[k] - base_[k]
             rises = moved >= on_base + on_slope * np.float32(q_on[k])
             falls = -moved >= off_base + off_slope * np.float32(q_off[k])
             stirred[k] = np.uint8(rises) | np.uint8(falls) | reset[k]
-        for k in range(stop - start):
-            if k % 8 == 0 and eights[k // 8] == 0:
+        for eight in range((stop - start + 7) // 8):
+            if eights[eight] == 0:
                 continue
-            if stirred[k] == 0:
-                continue
-            i = start + k
-            first, last = before[k], level[i]
-            slope = (last - first) / step
-            base = reference[i]
-            free_us = begin_us
-            if held[i] != 0:
-                if release_us[i] >= end_us:
+            for k in range(8 * eight, min(8 * eight + 8, stop - start)):
+                if stirred[k] == 0:
                     continue
-                free_us = max(begin_us, release_us[i])
-                base = first + slope * np.float32(free_us - begin_us)
-                held[i] = 0
-            threshold_on = on_base + on_slope * np.float32(spread_on[i])
-            threshold_off = off_base + off_slope * np.float32(spread_off[i])
-            while held[i] == 0:
-                if last - base >= threshold_on:
-                    on, crossing = 1, base + threshold_on
-                elif base - last >= threshold_off:
-                    on, crossing = 0, base - threshold_off
-                else:
-                    break
-                at_us = free_us
-                if slope != np.float32(0):
-                    at_us = begin_us + int((crossing - first) / slope)
-                at_us = min(max(at_us, free_us), end_us - 1)
-                if count < capacity:
-                    out_t[count] = at_us
-                    out_pixel[count] = i
-                    out_on[count] = on
-                count += 1
-                free_us = at_us + refractory_us
-                if free_us >= end_us:
-                    held[i] = 1
-                    release_us[i] = free_us
-                else:
+                i = start + k
+                first, last = before[k], level[i]
+                slope = (last - first) / step
+                base = reference[i]
+                free_us = begin_us
+                if held[i] != 0:
+                    if release_us[i] >= end_us:
+                        continue
+                    free_us = max(begin_us, release_us[i])
                     base = first + slope * np.float32(free_us - begin_us)
-            reference[i] = base
+                    held[i] = 0
+                threshold_on = on_base + on_slope * np.float32(spread_on[i])
+                threshold_off = off_base + off_slope * np.float32(spread_off[i])
+                while held[i] == 0:
+                    if last - base >= threshold_on:
+                        on, crossing = 1, base + threshold_on
+                    elif base - last >= threshold_off:
+                        on, crossing = 0, base - threshold_off
+                    else:
+                        break
+                    at_us = free_us
+                    if slope != np.float32(0):
+                        at_us = begin_us + int((crossing - first) / slope)
+                    at_us = min(max(at_us, free_us), end_us - 1)
+                    if count < capacity:
+                        out_t[count] = at_us
+                        out_pixel[count] = i
+                        out_on[count] = on
+                    count += 1
+                    free_us = at_us + refractory_us
+                    if free_us >= end_us:
+                        held[i] = 1
+                        release_us[i] = free_us
+                    else:
+                        base = first + slope * np.float32(free_us - begin_us)
+                reference[i] = base
     return count
 
 
@@ -288,6 +289,7 @@ class EventSensor:
         self._noise_hz = noise_hz
         self._leak_hz = leak_hz
         self._unsettled_since_us = -NEVER_US
+        self._unsettled = False
         unit = MISMATCH_SD / MISMATCH_STEP
         drawn = np.clip(np.rint(128 + unit * pattern.standard_normal((2, height, width))), 0, 255)
         self._spread_on, self._spread_off = drawn.astype(np.uint8)
@@ -329,13 +331,11 @@ class EventSensor:
     def apply_biases(self, biases: BiasSet, now_us: int) -> None:
         """Switch thresholds and refractory time; for a few milliseconds the pixels fire without order.
 
-        What fires in that time is not held longer than it lasts, as if the comparators' bias were still moving.
+        Moving biases disturb what the pixels remember: at the end of that time all are reset, at their present level.
         """
         self._biases = self._sets[biases]
         self._unsettled_since_us = now_us
-        held_until = now_us + self._biases.refractory_us
-        np.minimum(self._release_us, held_until, out=self._release_us)
-        self._apply_mask()
+        self._unsettled = True
 
     def restart(self) -> None:
         """Let all pixels begin anew, at whatever they are settled on next."""
@@ -369,6 +369,11 @@ class EventSensor:
     def begin(self, begin_us: int, end_us: int) -> None:
         """Open a span of time; its steps follow in order, then ``finish``."""
         self._begin_us, self._end_us, self._count = begin_us, end_us, 0
+        if self._unsettled and begin_us >= self._unsettled_since_us + UNSETTLED_US:
+            self._unsettled = False
+            self._reference[:] = self.level
+            self._held.fill(0)
+            self._apply_mask()
 
     def noise(self, begin_us: int, end_us: int) -> None:
         """Let noise, leakage and hot pixels fire in a part of the span, before the same part's ``step``."""
@@ -377,13 +382,9 @@ class EventSensor:
             return
         biases = self._biases
         dice = self._chance.random(len(times), np.float32)
-        settled_us = self._unsettled_since_us + UNSETTLED_US
-        held_for_us = (
-            biases.refractory_us if begin_us >= settled_us else min(biases.refractory_us, settled_us - begin_us)
-        )
         self._count = fire_noise(
             times, pixels, kinds, self.level.ravel(), self._reference.ravel(), self._held.ravel(),
-            self._release_us.ravel(), np.float32(biases.c_on), np.float32(biases.c_off), dice, held_for_us,
+            self._release_us.ravel(), np.float32(biases.c_on), np.float32(biases.c_off), dice, biases.refractory_us,
             self._count, self._out_t, self._out_pixel, self._out_on,
         )  # fmt: skip
 
