@@ -105,14 +105,14 @@ class GrblLens:
         self._sampled_from_ns = 0
         self._unanswered_since_ns: int | None = None
         self._next_query_ns = 0
-        self._read_ns = 0
+        self._read_ns = self._line_begun_ns = self._line_end_ns = 0
         self._unacknowledged: deque[int | None] = deque()
         self._status: Status | None = None
         self._report: LensReport | None = None
         self._wish: _Wish | None = None
         self._cruise_sps = 0.0
         self._stopping = False
-        self._resetting = False
+        self._resetting = self._locked_by_stop = False
         self._referenced = False
         self._implausible = 0
         self._rest_due_ns: int | None = None
@@ -155,7 +155,7 @@ class GrblLens:
         self._take_board_settings(self._ask("$$", "$"))
         self._trajectory = self._new_trajectory()
         if status.state not in {"Idle", "Alarm"}:
-            self._port.write(CANCEL)
+            self._write(CANCEL)
             status = self._await_idle(after_ms(self._clock.now_ns(), 1000))
         self._referenced = status.state == "Idle" and self._settings.trust_position and not self._resetting
         self._resetting = False
@@ -184,7 +184,7 @@ class GrblLens:
             raise self._trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
         with self._lock:
             self._trajectory.begin(report)
-        self._referenced = True
+        self._referenced, self._locked_by_stop = True, False
         return self._flagged(report)
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
@@ -207,9 +207,9 @@ class GrblLens:
         self._wish = None
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
-            self._resetting = True
+            self._resetting = self._locked_by_stop = True
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         with self._lock:
             self._note_stop(mode, begun)
@@ -275,7 +275,7 @@ class GrblLens:
             number = self._trajectory.command(motion, effective, 2 * NS_PER_MS)
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 100 * NS_PER_MS
         self._unacknowledged.append(number)
-        self._port.write(line)
+        self._write(line)
         self._cruise_sps, self._stopping, self._stops_ignored = wish.speed_sps, False, 0
         return CommandStamp(name, begun, self._clock.now_ns())
 
@@ -319,7 +319,7 @@ class GrblLens:
                 )
         lost = self._query_ns is not None and now - self._query_ns > self._settings.reply_ms * NS_PER_MS / 3
         if lost or (self._query_ns is None and now >= self._next_query_ns):
-            self._port.write(STATUS)
+            self._write(STATUS)
             with self._lock:
                 self._sampled_from_ns = self._on_wire(1, now)
             self._query_ns = now
@@ -330,23 +330,26 @@ class GrblLens:
 
     def _take_lines(self, *, fuse: bool) -> LensReport | None:
         """Read and act on every complete line; return the newest report."""
-        try:
-            data = self._port.read_available()
-        except LensError as error:
-            raise self._trouble(str(error).removeprefix("lens: ")) from None
+        data = self._read()
         before, now = self._read_ns, self._clock.now_ns()
         self._read_ns = now
         newest = None
         for line, bytes_after in self._lines.feed(data):
             # when the line's first byte can have left the board, at the latest
-            begun = now - (len(line) + 2 + bytes_after) * self._byte_ns
+            length_ns = (len(line) + 2) * self._byte_ns
+            begun = now - length_ns - bytes_after * self._byte_ns
             if line.startswith("<"):
                 status = parse_status(line)
                 newest = (self._take_status(status, begun, fuse=fuse) if status else None) or newest
             elif line == "ok":
-                self._acknowledged(before, begun)
+                # not before the last look at the port, unless it had to wait behind the line before it
+                earliest = before - length_ns
+                if earliest < self._line_end_ns:
+                    earliest = self._line_begun_ns
+                self._acknowledged(earliest, begun)
             else:
                 self._heed(line)
+            self._line_begun_ns, self._line_end_ns = begun, begun + length_ns
         return newest
 
     def _acknowledged(self, earliest: int, latest: int) -> None:
@@ -358,10 +361,11 @@ class GrblLens:
             return
         width = max(latest - earliest, 0)
         with self._lock:
-            sigma_ns = max(width / 12**0.5, 100 * NS_PER_US)
-            self._trajectory.amend(number, latest - min(width, 4 * NS_PER_MS) // 2, sigma_ns)
+            self._trajectory.amend(number, latest - width // 2, max(width / 12**0.5, 100 * NS_PER_US))
+            if not self._stopping:
+                self._rest_due_ns = (self._trajectory.at_rest_from() or latest) + 100 * NS_PER_MS
         if self._stopping:
-            self._port.write(CANCEL)  # the first one may have come before there was anything to cancel
+            self._write(CANCEL)  # the first one may have come before there was anything to cancel
 
     def _heed(self, line: str) -> None:
         """Act on what the board says by itself."""
@@ -383,7 +387,7 @@ class GrblLens:
         if self._query_ns is None:
             return None  # late or duplicate: its instant of sampling is unknown
         self._query_ns = None
-        if status.state == "Alarm" and self._busy() and not self._resetting and not self._unacknowledged:
+        if status.state == "Alarm" and self._busy() and not self._locked_by_stop and not self._unacknowledged:
             raise self._trouble("GRBL fell into Alarm during a motion; clear the cause, home")
         moving = status.state in {"Jog", "Run", "Home", "Hold:1"}
         velocity = None if moving else 0.0
@@ -439,7 +443,7 @@ class GrblLens:
         self._stops_ignored += 1
         if self._stops_ignored > 3:
             raise self._trouble(f"the motor still runs after {self._stops_ignored - 1} stops; the board was reset")
-        self._port.write(CANCEL)
+        self._write(CANCEL)
         self._stopping = True
 
     def _flagged(self, report: LensReport) -> LensReport:
@@ -461,10 +465,10 @@ class GrblLens:
         while True:
             now = self._clock.now_ns()
             if reset_at is not None and now >= reset_at:
-                self._port.write(RESET)
+                self._write(RESET)
                 self._resetting, reset_at = True, due
             if now >= ask_at:
-                self._port.write(STATUS)
+                self._write(STATUS)
                 ask_at = after_ms(now, 100)
             for line, _ in self._lines.feed(self._port.read_available()):
                 status = parse_status(line)
@@ -481,8 +485,9 @@ class GrblLens:
 
     def _ask(self, line: str, beginning: str) -> list[str]:
         """Send a line and collect the lines that begin so, up to its ``ok``."""
-        self._port.write(f"{line}\n".encode("ascii"))
-        due, answers = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms), []
+        self._write(f"{line}\n".encode("ascii"))
+        due = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms)
+        answers: list[str] = []
         while True:
             for got, _ in self._lines.feed(self._port.read_available()):
                 if got == "ok":
@@ -519,14 +524,12 @@ class GrblLens:
             )
         max_um = travel_mm * 1000 if table.max_um is None else table.max_um
         speed_um_s = board[110] / 60 * 1000
-        for name, wanted, number, has in (
+        for name, wanted, code, has in (
             ("max_um", max_um, 130, travel_mm * 1000),
             ("max_speed_um_s", table.max_speed_um_s or speed_um_s, 110, speed_um_s),
         ):
             if wanted > has * (1 + 1e-6):
-                raise ConfigError(
-                    f"lens.{name} is {wanted:g}, the board's ${number} allows {has:g}; change one of them"
-                )
+                raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${code} allows {has:g}; change one of them")
         acceleration = board[120] * 1000
         if table.acceleration_um_s2 is not None and abs(table.acceleration_um_s2 / acceleration - 1) > 1e-3:
             raise ConfigError(
@@ -542,7 +545,7 @@ class GrblLens:
         quantum = 0.001 * self._steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
         return Trajectory(
-            Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum_steps=quantum, rest_quantum_steps=quantum),
+            Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum, rest_quantum_steps=quantum, ramp_steps=1.5),
             floor_steps=0.3,
         )
 
@@ -559,7 +562,7 @@ class GrblLens:
         with self._lock:
             self._on_wire(len(line), self._clock.now_ns())
         self._unacknowledged.append(number)
-        self._port.write(line)
+        self._write(line)
 
     def _on_wire(self, count: int, begun: int) -> int:
         """Return when the last of *count* bytes written at *begun* leaves the wire, behind those before it."""
@@ -572,6 +575,26 @@ class GrblLens:
             raise self._trouble(why)
         self._clock.sleep_until(after_ms(now, 1))
 
+    def _write(self, data: bytes) -> None:
+        """Write, or latch that the line is dead."""
+        try:
+            self._port.write(data)
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _read(self) -> bytes:
+        """Read what has come, or latch that the line is dead."""
+        try:
+            return self._port.read_available()
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+        self._referenced = False
+
     def _check_fault(self) -> None:
         if self._fault is not None:
             raise LensError(self._fault)
@@ -582,6 +605,6 @@ class GrblLens:
             self._port.write(RESET)
         except LensError as error:
             what = f"{what} (and the reset could not be written: {error})"
-        self._fault = f"lens: {what}"
-        self._referenced, self._wish = False, None
+        self._wish = None
+        self._latch(f"lens: {what}")
         return LensError(self._fault)

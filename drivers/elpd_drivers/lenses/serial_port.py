@@ -97,6 +97,8 @@ class SerialPort:
         while data:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
+                with suppress(termios.error):
+                    termios.tcflush(descriptor, termios.TCOFLUSH)  # so that a stop is not queued behind this
                 raise LensError(
                     f"lens port {self.path}: the far end takes no bytes ({len(data)} left after "
                     f"{WRITE_TIMEOUT_S * 1e3:.0f} ms); check its power and flow control"

@@ -257,14 +257,15 @@ class TicLens:
             now = self._clock.now_ns()
             steps = self._trajectory.position_at(now).steps
             moving_sps = self._trajectory.velocity_at(now)
-        target = run_target(steps, moving_sps, velocity_sps, until - now, self._limits, referenced=self._referenced)
+        spare_ns = until - now - self._latency_ns - 3 * self._sigma_ns - 14 * self._byte_ns
+        target = run_target(steps, moving_sps, velocity_sps, spare_ns, self._limits, referenced=self._referenced)
         return self._go(target, abs(velocity_sps), "run")
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte(s) now, from any thread; the books are kept afterwards."""
         data = self._stop_bytes[mode]
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         with self._lock:
             effective = self._on_wire(len(data), begun) + self._latency_ns
@@ -307,7 +308,7 @@ class TicLens:
         data = b"" if word == self._speed_word else self._frame(SET_MAX_SPEED, long_word(word))
         data += self._frame(SET_TARGET_POSITION, long_word(target))
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         self._speed_word = word
         with self._lock:
@@ -331,7 +332,7 @@ class TicLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = None
         now = self._clock.now_ns()
-        self._received += self._port.read_available()
+        self._received += self._read()
         if self._query and len(self._received) >= self._reply_length:
             report = self._parse(now, fuse=fuse)
         if self._unanswered_since_ns is not None:
@@ -345,7 +346,7 @@ class TicLens:
         if lost or (self._query is None and now >= self._next_query_ns):
             self._received.clear()
             begun = self._clock.now_ns()
-            self._port.write(self._query_bytes)
+            self._write(self._query_bytes)
             with self._lock:
                 end = self._on_wire(len(self._query_bytes), begun)
             self._query = _Query(begun, end - (len(self._query_bytes) - self._query_head) * self._byte_ns)
@@ -435,12 +436,12 @@ class TicLens:
             return
         self._stops_ignored += 1
         if self._stops_ignored > 3:
-            self._port.write(self._frame(DEENERGIZE))
+            self._write(self._frame(DEENERGIZE))
             raise self._trouble(
                 f"the motor still runs at {report.velocity_sps or 0.0:.0f} steps/s after "
                 f"{self._stops_ignored - 1} stops; its driver was switched off"
             )
-        self._port.write(self._stop_bytes[StopMode.ABRUPT])
+        self._write(self._stop_bytes[StopMode.ABRUPT])
 
     def _flagged(self, report: LensReport) -> LensReport:
         flags = report.flags
@@ -460,7 +461,7 @@ class TicLens:
 
     def _send(self, data: bytes) -> None:
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         with self._lock:
             self._on_wire(len(data), begun)
 
@@ -476,7 +477,7 @@ class TicLens:
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
         expected = length + self._settings.crc_responses
         while True:
-            self._received += self._port.read_available()
+            self._received += self._read()
             now = self._clock.now_ns()
             if len(self._received) >= expected:
                 break
@@ -506,6 +507,26 @@ class TicLens:
                 raise self._trouble("no report after connecting; check the cable")
             self._clock.sleep_until(after_ms(now, 0.5))
 
+    def _write(self, data: bytes) -> None:
+        """Write, or latch that the line is dead."""
+        try:
+            self._port.write(data)
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _read(self) -> bytes:
+        """Read what has come, or latch that the line is dead."""
+        try:
+            return self._port.read_available()
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+        self._referenced = False
+
     def _check_fault(self) -> None:
         if self._fault is not None:
             raise LensError(self._fault)
@@ -516,6 +537,5 @@ class TicLens:
             self._port.write(self._stop_bytes[StopMode.ABRUPT])
         except LensError as error:
             what = f"{what} (and the halt could not be written: {error})"
-        self._fault = f"lens: {what}"
-        self._referenced = False
+        self._latch(f"lens: {what}")
         return LensError(self._fault)

@@ -21,7 +21,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from elpd.motion.trajectory import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
+from elpd.motion.kinematics import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from elpd_drivers.sim.boards import grbl_text as text
 from elpd_drivers.sim.boards.grbl_text import GrblError, GrblSettings
@@ -191,7 +191,7 @@ class GrblBoard:
         self._say_hello(at_ns + 500 * NS_PER_MS)
 
     def _lines_wait(self) -> bool:
-        """Say whether the main loop is elsewhere: homing, suspended by a hold or a jog cancel, or dead after an alarm."""
+        """Say whether the main loop is elsewhere: homing, suspended by a hold or cancel, or dead after an alarm."""
         cancelling = self._motion is not None and self._motion.holding
         return self._silent or self._held or cancelling or self._state == "Home"
 

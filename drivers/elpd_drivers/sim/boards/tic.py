@@ -235,7 +235,7 @@ class TicBoard:
         if command in _BLOCK:
             self._answer(command, payload, at_ns)
         elif command in _LONG:
-            self._execute_long(command, _decode_long(payload), at_ns)
+            self._execute_long(command, decode_long(payload), at_ns)
         elif command in _SEVEN_BIT:
             self._execute_seven_bit(command, payload[0])
         else:
@@ -513,7 +513,7 @@ def _payload_length(command: int) -> int | None:
     return 5 if command in _LONG else None
 
 
-def _decode_long(payload: bytes) -> int:
+def decode_long(payload: bytes) -> int:
     """Put the top bits, sent together in the first byte, back on their bytes."""
     raw = bytes(payload[1 + i] | ((payload[0] >> i) & 1) << 7 for i in range(4))
     return int.from_bytes(raw, "little", signed=True)
