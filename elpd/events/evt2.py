@@ -85,7 +85,6 @@ def take_rare_evt2_word(word: Integer, t: Integer, state: NDArray[np.int64], tri
     """Account for a word that is neither an event nor TIME_HIGH. *t* is its time, where it has one."""
     kind = word >> 28
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (word >> 8) & 0x1F, word & 1, state, triggers)
     elif kind in (0xE, 0xF):
         state[OTHERS] += 1
@@ -99,12 +98,10 @@ def take_rare_evt21_word(
 ) -> None:
     """Account for a word, given as its halves, that is neither an event nor TIME_HIGH."""
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (upper >> 8) & 0x1F, upper & 1, state, triggers)
     elif kind == 0xE:
         subtype = upper & 0xFFFF
         if subtype in (COUNT_BEFORE_CONTROLLER, COUNT_AFTER_CONTROLLER):
-            state[LOW] = t & 0x3F
             state[RATE_BEFORE if subtype == COUNT_BEFORE_CONTROLLER else RATE_AFTER] += lower & COUNT_MASK
             state[RATE_COUNTS] += 1
         else:

@@ -46,6 +46,7 @@ def new_window() -> NDArray[np.int64]:
     window = np.zeros(WINDOW_SIZE, np.int64)
     window[CURSOR] = -1
     window[LATE_MARK] = -1
+    window[NOW] = NEVER
     return window
 
 
