@@ -96,7 +96,7 @@ class SimSettings:
     travel_um: float = 2500.0
     um_per_step: float = 0.3125
     backlash_um: float = 4.0
-    acceleration_um_s2: float = 200_000.0
+    acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
     # faults of the camera
     camera_vanishes_at_s: float | None = None
