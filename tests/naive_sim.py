@@ -42,7 +42,7 @@ def step_pixels(
     target: NDArray[Any],
     level: NDArray[Any],
     reference: NDArray[Any],
-    rate: NDArray[Any],
+    gain: NDArray[Any],
     spread_on: NDArray[Any],
     spread_off: NDArray[Any],
     held: NDArray[Any],
@@ -59,8 +59,7 @@ def step_pixels(
     span = F(end_us - begin_us)
     for i in range(len(target)):
         first = level[i]
-        gain = span * rate[i]
-        level[i] = last = first + (target[i] - first) * (gain / (F(1) + gain))
+        level[i] = last = first + (target[i] - first) * gain[i]
         slope = (last - first) / span
         on_at = F(c_on) * (F(1) - F(128) * F(spread)) + F(c_on) * F(spread) * F(spread_on[i])
         off_at = F(c_off) * (F(1) - F(128) * F(spread)) + F(c_off) * F(spread) * F(spread_off[i])

@@ -24,7 +24,7 @@ def _state(seed: int, n: int, begin_us: int) -> dict[str, np.ndarray]:
         "target": level + rng.normal(0, 0.4, n).astype(F),
         "level": level,
         "reference": level + rng.uniform(-0.15, 0.15, n).astype(F),
-        "rate": rng.uniform(1 / 2000, 1 / 60, n).astype(F),
+        "gain": rng.uniform(0.05, 0.95, n).astype(F),
         "spread_on": rng.integers(0, 256, n).astype(np.uint8),
         "spread_off": rng.integers(0, 256, n).astype(np.uint8),
         "held": rng.integers(0, 2, n).astype(np.uint8),
@@ -160,6 +160,28 @@ def test_first_on_events_of_an_opening_map_the_scene() -> None:
     assert rank_correlation(-first[fired], intensity[fired]) > 0.95
     _, per_pixel = np.unique(true_on["y"].astype(int) * 160 + true_on["x"], return_counts=True)
     assert per_pixel.mean() < 1.05
+
+
+def test_a_second_exposure_is_as_good_as_the_first() -> None:
+    setup = Setup(with_aperture=True, scene="camera", size=(160, 120))
+    setup.run(0.001)
+    spreads = []
+    for _ in range(2):
+        now_s = (setup.world.now_ns() - 1e9) / 1e9
+        setup.camera.apply_biases(BiasSet.EXPOSE)
+        setup.packets(now_s + 0.006)
+        setup.aperture.open()
+        events = setup.run(now_s + 0.040)
+        first = np.full((120, 160), np.nan)
+        true_on = events[events["on"] & (events["t"] > (setup.aperture.began_ns - 1e9) / 1e3)][::-1]
+        first[true_on["y"], true_on["x"]] = true_on["t"] - (setup.aperture.began_ns - 1e9) / 1e3
+        fired = np.isfinite(first)
+        spreads.append(rank_correlation(-first[fired], setup.canvas[32:-32, 32:-32][fired]))
+        assert fired.mean() > 0.97
+        setup.camera.apply_biases(BiasSet.FOCUS)
+        setup.aperture.close()
+        setup.packets(now_s + 0.1)
+    assert spreads[1] == pytest.approx(spreads[0], abs=0.005)
 
 
 def test_after_switching_biases_events_are_disordered_for_a_few_milliseconds() -> None:
