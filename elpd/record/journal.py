@@ -105,9 +105,9 @@ class RunWriter:
             self.tape = TapeWriter(self.path, memory_limit_bytes=self._memory_limit_bytes, opener=opener)
 
     @classmethod
-    def begin(cls, config: Config, request: Any, parts: RigParts) -> Self:
-        """Open a run for *parts*; ``run.parts`` is the rig to use from here on."""
-        run = cls(config, request)
+    def begin(cls, config: Config, request: Any, parts: RigParts, **options: Any) -> Self:
+        """Open a run for *parts*; ``run.parts`` is the rig to use from here on. *options* as in the constructor."""
+        run = cls(config, request, **options)
         run.parts = parts if run.path is None else tape_rig(parts, run.tape)
         return run
 
