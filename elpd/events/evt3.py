@@ -52,6 +52,7 @@ from elpd.events.registers import (
     VECTOR_X,
     X_OUT_OF_RANGE,
     Y_OUT_OF_RANGE,
+    Integer,
     hold_trigger,
 )
 
@@ -72,7 +73,7 @@ class Evt3Decoder(WordDecoder):
 
 
 @kernel()
-def take_rare_word(word: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
+def take_rare_word(word: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
     """Account for a word that is neither time, address nor vector. *triggers* is (n, 3): t, id, rising."""
     kind = word >> 12
     content = word & 0xFFF

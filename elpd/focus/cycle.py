@@ -255,6 +255,7 @@ class FocusCycle:
             raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
+        turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
         self._stage.listener = None
@@ -268,6 +269,7 @@ class FocusCycle:
                 speed_um_s=speed_um_s,
                 max_travel_um=reach_um,
                 braking_um=braking_um,
+                turn_s=turn_s,
                 deadline_ns=self._deadline_ns,
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,

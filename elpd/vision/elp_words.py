@@ -18,7 +18,7 @@ import numpy as np
 from elpd.events.bits import trailing_zeros
 from elpd.events.evt3 import WORDS, skip_to_time, take_rare_word
 from elpd.events.jit import kernel
-from elpd.events.registers import HIGH, LOOP, LOW, MAX_SIDE, ROW, VECTOR_ON, VECTOR_X
+from elpd.events.registers import HIGH, LOOP, LOW, MAX_SIDE, ROW, VECTOR_ON, VECTOR_X, Integer
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import (
     BEGIN,
@@ -51,7 +51,7 @@ SIGNATURE = (
 
 @kernel()
 def store_sums(  # noqa: D103
-    window: NDArray[np.int64], elp: int, energy: int, n_on: int, n: int, n_capped: int
+    window: NDArray[np.int64], elp: Integer, energy: Integer, n_on: Integer, n: Integer, n_capped: Integer
 ) -> None:
     window[ELP] = elp
     window[ENERGY] = energy

@@ -40,7 +40,11 @@ ENCODINGS = {
     "2.1": Encoding.EVT21,
 }
 NAMES = {Encoding.EVT3: "EVT3", Encoding.EVT2: "EVT2", Encoding.EVT21: "EVT2.1"}
-WORDS = {Encoding.EVT3: np.dtype("<u2"), Encoding.EVT2: np.dtype("<u4"), Encoding.EVT21: np.dtype("<u8")}
+WORDS: dict[Encoding, np.dtype[Any]] = {
+    Encoding.EVT3: np.dtype("<u2"),
+    Encoding.EVT2: np.dtype("<u4"),
+    Encoding.EVT21: np.dtype("<u8"),
+}
 EVT21_KINDS = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 
 VGA, HD = Geometry(640, 480), Geometry(1280, 720)
@@ -105,7 +109,7 @@ class RawReader:
         """Yield the words from the beginning of the payload, at most *max_bytes* at a time."""
         dtype = WORDS[self.encoding]
         buffer = np.empty(max(max_bytes // dtype.itemsize, 1), dtype)
-        room = memoryview(buffer).cast("B")
+        room = buffer.data.cast("B")
         self._notes["lost"], self._notes["lost_reason"] = 0, []
         self._file.seek(self._offset)
         held = 0

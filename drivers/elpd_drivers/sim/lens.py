@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elpd.motion.trajectory import Piece, approach, ramp
+from elpd.motion.kinematics import Piece, approach, ramp
 from elpd.units import NS_PER_S
 
 if TYPE_CHECKING:
