@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
@@ -20,6 +20,9 @@ from elpd.record.journal import RunWriter
 from elpd.record.replay import load_run, replay_run
 from elpd.record.tape import open_file
 from elpd.records import Outcome
+
+if TYPE_CHECKING:
+    from elpd.records import FocusResult
 
 
 def config_for(directory: Path, **sim: Any) -> Config:
@@ -85,18 +88,34 @@ def test_a_cancelled_run_replays(tmp_path: Path) -> None:
     assert report.first_difference is None
 
 
-@pytest.mark.parametrize("full", ["tape.jsonl", "events.raw", "decisions.jsonl", "run.json.tmp"])
-def test_a_full_disk_does_not_keep_the_lens_from_focus(tmp_path: Path, full: str) -> None:
+@pytest.fixture(scope="module")
+def undisturbed() -> dict[str, FocusResult]:
+    """How the cycles end with no journal at all."""
+    return {
+        camera: focus_once(
+            Config.model_validate({"journal": {"enabled": False}, "sim": {"seed": 4, "camera": camera}}), FocusRequest()
+        ).result
+        for camera in ("evk4", "davis346")
+    }
+
+
+@pytest.mark.parametrize(
+    ("full", "camera"),
+    [("tape.jsonl", "evk4"), ("events.raw", "evk4"), ("decisions.jsonl", "davis346"), ("run.json.tmp", "davis346")],
+)
+def test_a_full_disk_changes_nothing_about_the_cycle(
+    undisturbed: dict[str, FocusResult], tmp_path: Path, full: str, camera: str
+) -> None:
     def opener(path: Path, mode: str, /) -> Any:
         return open_file(Path("/dev/full") if path.name == full else path, mode)
 
-    config, request = config_for(tmp_path, camera="davis346" if full == "decisions.jsonl" else "evk4"), FocusRequest()
+    config, request = config_for(tmp_path, camera=camera), FocusRequest()
     parts = rig.build(config)
     with structlog.testing.capture_logs() as logs:
         with RunWriter.begin(config, request, parts, opener=opener) as run:
             result = FocusCycle(run.parts, CycleSettings.from_config(config), request, run).run()
         rig.release(parts)
-    assert result.outcome is Outcome.FOCUSED
+    assert result == undisturbed[camera]
     assert run.truncated is not None
     assert "No space left on device" in run.truncated
     assert [entry["event"] for entry in logs] == ["journal truncated; focus goes on"]
