@@ -306,7 +306,7 @@ class TapeWriter:
         self._frames += 1
         pixels = frame.pixels
         as_png = pixels.dtype in _PNG_TYPES and pixels.ndim == 2 and pixels.size > 0
-        name = f"frames/{self._frames:06d}.{'png' if as_png else 'npy'}"
+        name = frame_name(self._frames) if as_png else f"frames/{self._frames:06d}.npy"
         with self._open(name) as file:
             if as_png:
                 file.write(cv2.imencode(".png", pixels)[1].tobytes())
@@ -329,6 +329,11 @@ def tape_rig(parts: RigParts, tape: TapeWriter) -> RigParts:
     facts = RigFacts.of(parts)
     tape.begin(facts, methods_of(parts))
     return replace(build_doubles(facts, tape), truth=parts.truth)
+
+
+def frame_name(number: int) -> str:
+    """Return where the frame that came as the *number*-th lies, in the run's folder."""
+    return f"frames/{number:06d}.png"
 
 
 def _owned(packet: CameraPacket) -> CameraPacket:
