@@ -262,6 +262,7 @@ class FocusCycle:
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
+        turned_at_um: float | None = None
         while True:
             self._details["sweep_sign"] = sign
             plan = SweepPlan(
@@ -273,6 +274,7 @@ class FocusCycle:
                 deadline_ns=self._deadline_ns,
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
+                turned_at_um=turned_at_um,
             )
             self._phase(Phase.SWEEP, sign=sign, position_um=self._here_um())
             report = sweep.run(plan)
@@ -298,6 +300,7 @@ class FocusCycle:
                     f"focus seemed to lie behind {self._reversals + 1} times; "
                     "does the subject move in depth? raise focus.max_reversals or hold it still",
                 )
+            turned_at_um = self._here_um() if report.end is SweepEnd.BEHIND else None
             if report.end is SweepEnd.RULE:
                 self._stage.rest(REST_LIMIT_MS)
             self._reversals += 1

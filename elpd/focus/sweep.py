@@ -47,6 +47,8 @@ class SweepPlan:
     deadline_ns: HostNs
     depth_of_focus_um: float
     stop_mode: StopMode
+    turned_at_um: float | None = None
+    """Where the reversal that led to this direction was commanded; ``None`` if there was none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,7 @@ class Sweep:
         until = min(plan.deadline_ns, after_ms(begun_ns, 1000.0 * travel_s + 500.0))
         reported_from = stage.report
         lens.run(plan.sign * plan.speed_um_s / stage.um_per_step, until)
-        watch.begin(plan.sign, stage.sensor_clock.to_sensor(begun_ns))
+        watch.begin(plan.sign, stage.sensor_clock.to_sensor(begun_ns), plan.turned_at_um)
         heard_ns = begun_ns
         while True:
             packet = stage.read(READ_TIMEOUT_S)

@@ -17,11 +17,21 @@ import numpy as np
 from elpd.events.stream import PacketDecoder
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, SYSTEMATIC_FRAMES, EventStretch, Witness, ask_events, fuse
-from elpd.vision.detector import Detector, RestingRate
+from elpd.vision.crossing import (
+    FLANK,
+    ROI_MARGIN_PX,
+    UNMEASURED_LAG_US,
+    EventStretch,
+    Witness,
+    ask_events,
+    frame_witness,
+    fuse,
+)
+from elpd.vision.detector import SIGMAS, Detector, RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.filters import PixelCap
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.refractory import refractory_period_us
 from elpd.vision.track import EventEnergy, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -41,6 +51,9 @@ MIN_EVENTS = 1_000
 TICKS_PER_DEPTH_OF_FOCUS = 4
 LOOK_BACK_DOF = 12.0
 """The curve of sharpness is drawn this far back from the stop: a peak is five depths of focus wide."""
+
+SIGMAS_AFTER_REVERSAL = 9.0
+"""A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
 
 SLOW_SHARE = 0.2
 """Windows with less than this share of the planned travel say little: the lens starts, stops or turns."""
@@ -112,6 +125,7 @@ class Watch:
         self._last_us = SensorUs(0)
         self._sign = 1
         self._begun_us = SensorUs(0)
+        self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
         self._frames: list[Frame] = []
         self.decided_us: SensorUs | None = None
@@ -142,16 +156,22 @@ class Watch:
         """Events per second that the region sends at rest."""
         return 1e6 * self._rest.events_per_us
 
-    def begin(self, sign: int, at_us: SensorUs) -> None:
-        """Begin a direction of travel: everything is judged afresh."""
+    def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
+        """Begin a direction of travel: everything is judged afresh.
+
+        *turned_at_um* is where a reversal was commanded. Until the lens has come back there the events say more about
+        the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
+        the verdict that led here was certain, so the opposite one must be more certain still.
+        """
         for packet in self._kept:  # the decoder's registers must not miss what lies between the directions
             self._decoder.feed(packet)
         self._kept.clear()
         self._kept_bytes = 0
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
-        self._detector = Detector(self._rest)
+        self._detector = Detector(self._rest, recede_sigmas=SIGMAS if turned_at_um is None else SIGMAS_AFTER_REVERSAL)
         self._sign = sign
+        self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
         self._samples = []
         self._frames = []
@@ -171,6 +191,8 @@ class Watch:
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
+                continue
+            if self._sign * sample.position_um < self._judge_from:
                 continue
             self._detector.feed(sample)
             if self._detector.mutation is not None and self.decided_us is None:
@@ -231,7 +253,8 @@ class Watch:
             track.positions[-1],
             self._brightness(),
         )
-        found = fuse([*self._ask_frames(), *said.witnesses()])
+        unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
+        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um)])
         if found is None:
             return None
         sign = self._sign
@@ -306,12 +329,14 @@ class Watch:
         t_us = np.ascontiguousarray(t_us[keep])
         if t_us.size < MIN_EVENTS:
             return None
+        x, y = x[keep].astype(np.uint16), y[keep].astype(np.uint16)
+        deaf_us = refractory_period_us(t_us, x, y, (height, width))
         return EventStretch(
             t_us,
-            x[keep].astype(np.uint16),
-            y[keep].astype(np.uint16),
+            x,
+            y,
             on[keep].astype(np.uint8),
-            self._sign * self._path(t_us),
+            self._sign * self._path(t_us + round(deaf_us)),
             height,
             width,
             ROI_MARGIN_PX,
@@ -368,7 +393,7 @@ class Watch:
         vertex = track.vertex() if track.passed else None
         if vertex is None:
             return []
-        return [Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * vertex.width)))]
+        return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]
 
     def _brightness(self) -> NDArray[np.float32]:
         roi, geometry = self._roi, self._geometry

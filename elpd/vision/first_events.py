@@ -11,7 +11,7 @@ is never alone: at least two of its eight neighbours fire before it, or about wh
 pixel at a random time, mostly long before its neighbours. A pixel of which no time can be believed is hot (its
 neighbours have fired together) or merely dark (they have not).
 
-Latching is O(1) per event and order-independent across packets; memory is 14 bytes per pixel, whatever the length of
+Latching is O(1) per event and the same however the stream is cut; memory is 14 bytes per pixel, whatever the length of
 the recording. Nothing here knows transmittance or intensity: that is ``elpd.vision.temporal_map``.
 """
 

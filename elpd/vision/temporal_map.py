@@ -132,9 +132,10 @@ def find_opening(first: FirstTimes) -> SensorUs:
     *Jitter* tells how long before that the light began: threshold mismatch and photon noise act on intensity, thus
     scatter a pixel's time in proportion to the time *since the opening*. A straight line through the scatter of the
     brighter half of the picture over its time crosses zero at the opening (within 20 us in simulated openings with
-    mismatch alone; additive timing noise draws it early, which flattens the bright end a little, while a late one
-    would make it explode). The result lies inside the interval, and not further before the earliest agreement than
-    the time in which half of the picture fired. Use the aperture driver's own time wherever there is one.
+    mismatch alone). A pixel's lag moves the crossing as it moves the events, which is as it should be: what counts is
+    the time since *this pixel* could see the opening. Additive timing noise draws it early, which flattens the bright
+    end a little, where a late one would make it explode. The result lies inside the interval, and at most three times
+    as long before the earliest agreement as the brighter half of the picture took to fire after it.
 
     Raises
     ------
@@ -151,11 +152,14 @@ def find_opening(first: FirstTimes) -> SensorUs:
     earliest_us = float(fired_us.min())
     half_us = float(np.median(fired_us))
     opening_us = min(_jitter_vanishes_us(first, agreed_us, half_us), earliest_us - TIMESTAMP_STEP_US)
-    opening_us = max(opening_us, 2 * earliest_us - half_us, 0.0)
+    opening_us = max(opening_us, earliest_us - REACH * (half_us - earliest_us), 0.0)
     return SensorUs(first.begin_us + round(opening_us))
 
 
 JITTER_BINS = 16
+
+REACH = 3.0
+"""How far a line is trusted beyond the data, in lengths of the data."""
 
 
 def _jitter_vanishes_us(first: FirstTimes, agreed_us: NDArray[np.float32], until_us: float) -> float:
