@@ -248,7 +248,7 @@ def forget_old_runs(parent: Path, keep: int) -> list[Path]:
     runs = sorted(folder for folder in parent.iterdir() if is_run(folder) and _FOLDER_NAME.fullmatch(folder.name))
     old = runs[: max(0, len(runs) - keep)]
     for folder in old:
-        shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)  # another process may be at it too; the next run tries again
     return old
 
 

@@ -258,7 +258,7 @@ class TapeWriter:
 
     def _packet(self, packet: CameraPacket) -> dict[str, Any]:
         stream, name = self._stream(packet.encoding, packet.data.dtype)
-        self._file(name).write(packet.data.tobytes())
+        self._file(name).write(_without_padding_noise(packet.data).tobytes())
         line: dict[str, Any] = {"stream": stream, "count": packet.data.size, "received_ns": packet.received_ns}
         line["complete_until_us"] = packet.complete_until_us
         if packet.frames:
@@ -342,6 +342,17 @@ def _owned(packet: CameraPacket) -> CameraPacket:
     if frames:
         frames = tuple(replace(frame, pixels=np.ascontiguousarray(frame.pixels).copy()) for frame in frames)
     return replace(packet, data=packet.data.copy(), frames=frames)
+
+
+def _without_padding_noise(data: NDArray[Any]) -> NDArray[Any]:
+    """Return events whose bytes between the fields are zero; what stood there was whatever the memory held before."""
+    names = data.dtype.names
+    if names is None or data.dtype.itemsize == sum(data.dtype[name].itemsize for name in names):
+        return data
+    clean = np.zeros(data.shape, data.dtype)
+    for name in names:
+        clean[name] = data[name]
+    return clean
 
 
 def _raised(error: BaseException) -> _Raised:
