@@ -23,6 +23,8 @@ from elpd.cli.drawing import BOLD, DIM, GREEN, LABEL, RED, RESET, Ink, curve, le
 from elpd.records import Outcome, Phase
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from elpd.records import ElpSample, FocusResult
 
 REDRAW_S = 1 / 15
@@ -194,7 +196,7 @@ def frame(seen: Seen, columns: int, *, colour: bool) -> list[str]:
     elif count:
         finite = positions[np.isfinite(positions)]
         marks |= {"S": float(finite[0]), "●": float(finite[-1])}
-        marks["x"] = _last_crossing(positions, scores)
+        marks["x"] = _sign_change(positions, scores)
     if result is not None:
         marks |= {"●": result.final_um, "F": result.focus_um}
     known = [mark for mark in marks.values() if mark is not None]
@@ -250,15 +252,12 @@ def _ending(result: FocusResult | None, columns: int, *, colour: bool) -> str:
     return f"{GREEN if result.outcome is Outcome.FOCUSED else RED}{text}{RESET}"
 
 
-def _last_crossing(
-    positions: np.ndarray[Any, np.dtype[np.float64]], scores: np.ndarray[Any, np.dtype[np.float64]]
-) -> float | None:
-    """Return where the smoothed score last fell through zero: for the eye, the verdict is the detector's."""
-    if scores.size < 8:
+def _sign_change(positions: NDArray[np.float64], scores: NDArray[np.float64]) -> float | None:
+    """Return where the running sum of the score was highest, once it falls: for the eye, not a verdict."""
+    if scores.size < 2:
         return None
-    smooth = np.convolve(np.nan_to_num(scores), np.full(5, 0.2), mode="same")
-    falls = np.flatnonzero((smooth[:-1] > 0) & (smooth[1:] <= 0))
-    return float(positions[falls[-1]]) if falls.size else None
+    highest = int(np.argmax(np.cumsum(np.nan_to_num(scores))))
+    return float(positions[highest]) if 0 < highest < scores.size - 1 else None
 
 
 def _described(fields: dict[str, Any]) -> str:
