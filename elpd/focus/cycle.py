@@ -237,7 +237,7 @@ class FocusCycle:
             reference,
             roi,
             geometry,
-            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um),
+            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=self.map is None),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
         )

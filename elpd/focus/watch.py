@@ -19,8 +19,10 @@ from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
 from elpd.vision.crossing import (
     FLANK,
+    LAG_UNEXPLAINED,
     ROI_MARGIN_PX,
     UNMEASURED_LAG_US,
+    WIDTHS_PER_DEPTH_OF_FOCUS,
     EventStretch,
     Witness,
     ask_events,
@@ -52,6 +54,10 @@ TICKS_PER_DEPTH_OF_FOCUS = 4
 LOOK_BACK_DOF = 12.0
 """The curve of sharpness is drawn this far back from the stop: a peak is five depths of focus wide."""
 
+LAG_UNEXPLAINED_BY_MAP = 0.15
+"""Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
+saturation, says which pixels are slow."""
+
 FAR_DROP = 0.6
 """How far down the far side of the peak the witnesses look, in log S: about as far as the flank this side."""
 
@@ -76,6 +82,8 @@ class WatchSettings:
 
     speed_um_s: float
     depth_of_focus_um: float
+    frames: bool = False
+    """Whether the reference is a frame, whose bright and dark are blurred, and not a temporal map."""
 
 
 class Watch:
@@ -121,6 +129,8 @@ class Watch:
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
+        self._fine_windows: ElpWindows | None = None
+        self._fine_detector = Detector()
         self._decoder = PacketDecoder(geometry)
         self._kept: deque[CameraPacket] = deque()
         self._kept_bytes = 0
@@ -171,8 +181,11 @@ class Watch:
         self._kept.clear()
         self._kept_bytes = 0
         if self._windows is None:
-            self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
+            options: dict[str, Any] = {"window_us": self._window_us, "rate_cap": True}
+            self._windows = ElpWindows(self._reference.weights, self._inside, **options)
+            self._fine_windows = ElpWindows(self._reference.fine, self._inside, **options)
         self._detector = Detector(self._rest, recede_sigmas=SIGMAS if turned_at_um is None else SIGMAS_AFTER_REVERSAL)
+        self._fine_detector = Detector()
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
@@ -185,10 +198,12 @@ class Watch:
     def feed(self, packet: CameraPacket) -> list[ElpSample]:
         """Judge one packet; return the windows it closed."""
         assert self._windows is not None, "begin() comes before feed()"
+        assert self._fine_windows is not None
         self.keep(packet)
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
-        for row in self._windows.feed(packet):
+        fine_rows = self._fine_windows.feed(packet)
+        for row, fine in zip(self._windows.feed(packet), fine_rows, strict=True):
             sample = self._located(row)
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
@@ -198,7 +213,8 @@ class Watch:
             if self._sign * sample.position_um < self._judge_from:
                 continue
             self._detector.feed(sample)
-            if self._detector.mutation is not None and self.decided_us is None:
+            self._fine_detector.feed(replace(sample, elp=int(fine["elp"]), energy=int(fine["energy"])))
+            if self.passed and self.decided_us is None:
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
         self.events_in_cycle += sum(sample.n_on + sample.n_off for sample in samples)
@@ -222,8 +238,14 @@ class Watch:
 
     @property
     def passed(self) -> bool:
-        """Whether the sign mutation is certain: focus has been passed."""
-        return self._detector.mutation is not None
+        """Whether the sign mutation is certain: focus has been passed.
+
+        The fine weights see it first, near focus; they have no say before the coarse ones know that focus was ahead,
+        because far from focus a lens inverts fine contrast.
+        """
+        if self._detector.mutation is not None:
+            return True
+        return self._detector.direction is Direction.APPROACHING and self._fine_detector.mutation is not None
 
     @property
     def direction(self) -> Direction:
@@ -254,7 +276,9 @@ class Watch:
             _until(stretch, end_um), track.positions[track.flank(FLANK)], peak_um, end_um, self._brightness()
         )
         unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
-        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um)])
+        unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
+        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
+        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um, unexplained, width_um)])
         if found is None:
             return None
         sign = self._sign
@@ -280,7 +304,7 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
-        for row in self._windows.feed(packet):
+        for row in self._windows.feed(packet):  # fine windows rest: they are not judged any more
             self.events_in_cycle += int(row["n_on"] + row["n_off"])
 
     # --- pieces ---
@@ -305,6 +329,8 @@ class Watch:
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
+        if self._fine_windows is not None:
+            self._fine_windows.set_weights(self._reference.fine, self._inside)
 
     def _stretch(self) -> EventStretch | None:
         """Decode the kept packets: the region's events while the lens moved the right way, on its path."""
