@@ -1,4 +1,4 @@
-"""A small world for detector tests: a picture, Gaussian blur, a lens that sweeps, threshold pixels. Not elpd's simulator.
+"""A small world for detector tests: a picture, Gaussian blur, a lens that sweeps, threshold pixels.
 
 Every pixel compares its log intensity with its own last level at even steps of time and emits at most one event per
 step, stamped inside the step where the straight line crosses the threshold.
@@ -92,7 +92,9 @@ def sweep(
         noise = rng.random(now.shape) < noise_hz * step_us * 1e-6
         ny, nx = np.nonzero(noise & ~fired)
         t = np.concatenate([now_us - step_us + part * step_us, now_us - step_us + step_us * rng.random(ny.size)])
-        pieces.append((t, np.concatenate([x, nx]), np.concatenate([y, ny]), np.concatenate([up, rng.random(ny.size) < 0.5])))
+        pieces.append(
+            (t, np.concatenate([x, nx]), np.concatenate([y, ny]), np.concatenate([up, rng.random(ny.size) < 0.5]))
+        )
         previous = now
     t, x, y, on = (np.concatenate(column) for column in zip(*pieces, strict=True))
     t = t.astype(np.int64)

@@ -49,7 +49,8 @@ def score(case: Path, options: list[str]) -> dict[str, Any]:
     truth = json.loads((case / "truth.json").read_text())
     more = [first_frame(case) if one == "FIRST" else one for one in options]
     if truth.get("aperture_open_s") and "--aperture-us" not in more:
-        more += ["--aperture-us", f"0,{round(truth['aperture_open_s'][0] * 1e6)}", "--frames", "none"]
+        opened_us = round(truth["aperture_open_s"][0] * 1e6)
+        more += ["--aperture-us", f"0,{opened_us}", "--transmittance", "linear", "--frames", "none"]
     started = time.perf_counter()
     run = subprocess.run(  # noqa: S603  (our own program)
         [sys.executable, "-c", "from elpd.cli import main; main()", "detect", str(case), "--json", *more],

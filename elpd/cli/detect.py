@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     "--reference", "reference_path", type=click.Path(path_type=Path), help="An image that is there from the start."
 )
 @click.option("--aperture-us", "aperture_text", metavar="A,B", help="The aperture opened in this interval.")
-@click.option("--transmittance", default="linear", metavar="linear|iris|FILE", help="How it opened.")
+@click.option("--transmittance", default="iris", show_default=True, metavar="linear|iris|FILE", help="How it opened.")
 @click.option("--speed-um-s", type=float, help="Constant speed of the lens.")
 @click.option("--lens-path", "lens_path", type=click.Path(path_type=Path), help="CSV with rows t_us,position_um.")
 @click.option("--dof-um", type=float, help="Depth of focus.")

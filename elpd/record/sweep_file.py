@@ -22,6 +22,7 @@ from elpd.vision.crossing import (
     fuse,
 )
 from elpd.vision.detector import Detector
+from elpd.vision.filters import PixelCap
 from elpd.vision.memory import MIN_EVENTS, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS, Meter, Windows, WindowsByEvents, WindowsByTravel
 from elpd.vision.reference import Reference, check_size, reference_from_frame
@@ -97,7 +98,8 @@ class SweepSearch:
         windows: Windows = WindowsByEvents.for_roi(roi)
         if self._depth_of_focus_um is not None:
             windows = WindowsByTravel(ruler, TRAVEL_PER_DEPTH_OF_FOCUS * self._depth_of_focus_um)
-        self._meter = Meter(roi, windows, self._begin_us, ruler)
+        cap = PixelCap(sweep.geometry.height, sweep.geometry.width)
+        self._meter = Meter(roi, windows, self._begin_us, ruler, cap)
         self._detector = Detector()
         self._frames = PeakTrack()
         self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX)

@@ -1,11 +1,11 @@
 """Several witnesses, one focus position, one standard error.
 
-Mirror pairs, the vertex of the events' own image, the vertex of frames and the zero crossing of ELP each say where
-focus was. They fail for different reasons: pairs under scene motion, the events' vertex by pixels that have not
-answered yet, frames by exposure, the crossing (never used here) always late. So they are fused by their standard
-errors, which hold, beside scatter, what is known to be systematic. Widths and errors are in units of the curve's own width (``Vertex.width``),
-a fifth of which is a depth of focus, so that nothing here depends on scene, optics or speed. Witnesses that disagree
-beyond their errors widen the answer's.
+Mirror pairs, the vertex of the events' own image and the vertex of frames each say where focus was. They fail for
+different reasons: pairs under scene motion, the events' vertex by pixels that have not answered yet, frames by
+exposure. So they are fused by their standard errors, which hold, beside scatter, what is known to be systematic.
+(The zero crossing of ELP is no witness: it is late by the sensor's hysteresis, differently in every scene.) Widths and
+errors are in units of the curve's own width (``Vertex.width``), a fifth of which is a depth of focus, so that nothing
+here depends on scene, optics or speed. Witnesses that disagree beyond their errors widen the answer's.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class EventWitnesses:
     lag: Lag
 
     def witnesses(
-        self, unmeasured_lag: float, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
+        self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
     ) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
 

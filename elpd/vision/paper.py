@@ -9,8 +9,8 @@ instead is ``filter_of_the_paper``. In particular
   eight bits, which wrap;
 - synthetic and DAVIS bins are divided by their number of events, those outside the ROI included; EVK4's are raw sums;
 - the filter's threshold of 5·10⁴ is out of reach of normalised values, which leaves an exponential mean of 0.4;
-- a fixed threshold per data set triggers; the answer is then *looked back for* at the last sign change and moved earlier
-  by a constant tuned per data set;
+- a fixed threshold per data set triggers; the answer is then *looked back for* at the last sign change and moved
+  earlier by a constant tuned per data set;
 - in the synthetic set it may be overwritten until the next frame, in the EVK4 set until the recording ends: hindsight.
 
 So ``decided_us`` of this method is when the answer was last written, which is honest, and long after ``focus_us``.
