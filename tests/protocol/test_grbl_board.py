@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from elpd_drivers.lenses.grbl_lines import LineReader, jog_line, parse_status
@@ -113,7 +115,7 @@ def test_a_stop_bites_after_what_is_prepared_has_run(stop: bytes) -> None:
         say(made, b"$J=G91X1F240\n", 60 + 0.5 * phase)
         onsets.append(onset_ms(made, stop))
         assert "<Idle|" in say(made, b"?"), "a jog that is stopped is over"
-    print(f"\nonset of {stop!r}: {min(onsets):.1f} to {max(onsets):.1f} ms")
+    print(f"\nonset of {stop!r}: {min(onsets):.1f} to {max(onsets):.1f} ms")  # noqa: T201  (worth seeing)
     assert min(onsets) >= 39.9
     assert max(onsets) <= 50.5
     assert max(onsets) - min(onsets) > 5.0, "it depends on the phase of the running segment"
@@ -269,7 +271,7 @@ def test_a_jog_names_its_step_exactly(steps: int) -> None:
 def test_lines_do_not_depend_on_how_they_arrive(data: bytes, cuts: list[int]) -> None:
     whole = [line for line, _ in LineReader().feed(data)]
     reader, edges = LineReader(), [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
-    parts = [line for a, b in zip(edges, edges[1:], strict=False) for line, _ in reader.feed(data[a:b])]
+    parts = [line for a, b in pairwise(edges) for line, _ in reader.feed(data[a:b])]
     assert parts == whole
 
 

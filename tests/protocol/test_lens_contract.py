@@ -265,7 +265,7 @@ def test_another_board_on_the_port_is_refused(kind: str) -> None:
     other = "grbl" if kind == "tic" else "tic"
     made = rig(other)
     driver = tic_driver if kind == "tic" else grbl_driver
-    with pytest.raises(LensError, match="answered|no answer|no GRBL"):
+    with pytest.raises(LensError, match=r"answered|no answer|no GRBL"):
         driver.open_lens({}, made.clock, made.port)
     with pytest.raises(LensError, match="closed"):
         made.port.write(b"x")
@@ -280,9 +280,9 @@ def test_nobody_there_is_a_clear_error(kind: str) -> None:
 
 def test_unknown_and_wrong_settings_are_refused(kind: str) -> None:
     made = rig(kind)
-    with pytest.raises(ConfigError, match="lens.sped: unknown key"):
+    with pytest.raises(ConfigError, match=r"lens\.sped: unknown key"):
         made.open(sped=3)
-    with pytest.raises(ConfigError, match="lens.um_per_step"):
+    with pytest.raises(ConfigError, match=r"lens\.um_per_step"):
         made.open(um_per_step="small")
     with pytest.raises(ConfigError):
         made.open(min_um=100.0, max_um=50.0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import ticlib
-from elpd_drivers.lenses.tic import crc7, encode, long_word
-from elpd_drivers.sim.boards import tic as board_module
+from elpd_drivers.lenses.tic_wire import crc7, encode, long_word
+from elpd_drivers.sim.boards import tic_words as board_module
 from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import Rig, rig

@@ -19,12 +19,23 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from elpd.errors import ConfigError, LensError
+from elpd.errors import LensError
 from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, read_settings, run_target
-from elpd_drivers.lenses.grbl_lines import ALARM_WORDS, ERROR_WORDS, LineReader, Status, jog_line, parse_status
+from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
+from elpd_drivers.lenses.grbl_lines import (
+    ALARM_WORDS,
+    CANCEL,
+    ERROR_WORDS,
+    RESET,
+    STATUS,
+    LineReader,
+    Status,
+    jog_line,
+    parse_status,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,35 +43,7 @@ if TYPE_CHECKING:
     from elpd.ports import BytePort, Clock
     from elpd.records import LensLimits, PositionEstimate
 
-STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
 SEGMENT_S = 0.010
-_PORTS_OF_GRBL = ("[VER:1.1",)
-
-
-@dataclass(frozen=True, slots=True)
-class GrblLensSettings:
-    """The table ``[lens]`` for GRBL. What the board knows (``$100``, ``$110``, ``$120``, ``$130``) is read from it.
-
-    ``um_per_step`` must agree with the board's ``$100``. ``stop_onset_ms`` is the time from a stop byte to the first
-    slower segment. ``trust_position`` believes a board that is idle when it is opened; otherwise it must be homed
-    first. ``connect_ms`` is the patience with a board that boots when its port is opened.
-    """
-
-    port: str = ""
-    baud: int = 115_200
-    um_per_step: float = 0.3125
-    min_um: float = 0.0
-    max_um: float | None = None
-    max_speed_um_s: float | None = None
-    acceleration_um_s2: float | None = None
-    query_ms: float = 6.0
-    reply_ms: float = 60.0
-    connect_ms: float = 3000.0
-    stop_onset_ms: float = 45.0
-    stop_onset_sigma_ms: float = 3.0
-    latency_us: float = 225.0
-    latency_sigma_us: float = 110.0
-    trust_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,24 +127,10 @@ class GrblLens:
 
     def connect(self) -> None:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
-        self._port.read_available()
-        status = self._first_status()
-        due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
-        while status.state not in {"Idle", "Alarm"}:
-            # somebody else's motion; what a cancel does not end (a hold), a reset does
-            self._write(CANCEL if self._clock.now_ns() < due else RESET)
-            self._clock.sleep_until(after_ms(self._clock.now_ns(), 100))
-            status = self._first_status()
-        version = self._ask("$I", "[VER:")
-        if not any(line.startswith(_PORTS_OF_GRBL) for line in version):
-            raise LensError(
-                f"lens port {self._name}: this driver speaks GRBL 1.1, the board says {' '.join(version)[:80]!r}; "
-                "update its firmware, or choose another lens.board"
-            )
-        self._take_board_settings(self._ask("$$", "$"))
+        board = handshake(self._port, self._clock, self._settings)
+        self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
         self._trajectory = self._new_trajectory()
-        self._referenced = status.state == "Idle" and self._settings.trust_position and not self._resetting
-        self._resetting = False
+        self._referenced = board.idle and self._settings.trust_position and not board.restarted
         due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
         while self._poll(fuse=True) is None:
             self._wait(due, "no report after connecting; check the cable")
@@ -456,92 +425,6 @@ class GrblLens:
         if self._status is not None and self._status.state == "Alarm":
             flags |= LensFlag.ALARM
         return LensReport(report.steps, report.earliest_ns, report.latest_ns, report.velocity_sps, flags)
-
-    # --- connecting ------------------------------------------------------------------------------------------------
-
-    def _first_status(self) -> Status:
-        """Wait for a status report; a board that says nothing may be dead after an alarm, or booting."""
-        start = self._clock.now_ns()
-        due = after_ms(start, self._settings.connect_ms)
-        reset_at = after_ms(start, self._settings.connect_ms / 2)
-        ask_at, seen = start, ""
-        while True:
-            now = self._clock.now_ns()
-            if reset_at is not None and now >= reset_at:
-                self._write(RESET)
-                self._resetting, reset_at = True, due
-            if now >= ask_at:
-                self._write(STATUS)
-                ask_at = after_ms(now, 100)
-            for line, _ in self._lines.feed(self._port.read_available()):
-                status = parse_status(line)
-                if status is not None:
-                    return status
-                self._resetting = self._resetting or "Grbl" in line
-                seen = (seen + line)[-80:]
-            if now >= due:
-                raise LensError(
-                    f"lens port {self._name}: no GRBL answered within {self._settings.connect_ms:.0f} ms (saw "
-                    f"{seen!r}); check power, cable, baud ({self._settings.baud}) and lens.board"
-                )
-            self._clock.sleep_until(after_ms(now, 1))
-
-    def _ask(self, line: str, beginning: str) -> list[str]:
-        """Send a line and collect the lines that begin so, up to its ``ok``."""
-        self._write(f"{line}\n".encode("ascii"))
-        due = after_ms(self._clock.now_ns(), 10 * self._settings.reply_ms)
-        answers: list[str] = []
-        while True:
-            for got, _ in self._lines.feed(self._port.read_available()):
-                if got == "ok":
-                    return answers
-                if got.startswith(beginning):
-                    answers.append(got)
-                elif got.startswith("error:"):
-                    raise LensError(f"lens port {self._name}: GRBL answers {line} with {got}; is it GRBL 1.1?")
-            now = self._clock.now_ns()
-            if now >= due:
-                raise LensError(
-                    f"lens port {self._name}: no answer to {line} within {10 * self._settings.reply_ms:.0f} ms"
-                )
-            self._clock.sleep_until(after_ms(now, 1))
-
-    def _take_board_settings(self, lines: list[str]) -> None:
-        """Take travel, speed and acceleration from the board; refuse what contradicts the config."""
-        board: dict[int, float] = {}
-        for line in lines:
-            number, _, value = line[1:].split(" ")[0].partition("=")
-            try:
-                board[int(number)] = float(value)
-            except ValueError:
-                continue
-        missing = [f"${number}" for number in (100, 110, 120, 130) if board.get(number, 0.0) <= 0.0]
-        if missing:
-            raise LensError(f"lens port {self._name}: the board does not tell {', '.join(missing)}; is it GRBL 1.1?")
-        table = self._settings
-        per_mm, travel_mm = board[100], board[130]
-        if abs(per_mm * table.um_per_step / 1000 - 1) > 1e-3:
-            raise ConfigError(
-                f"lens.um_per_step is {table.um_per_step:g}, the board's $100 of {per_mm:g} steps/mm makes "
-                f"{1000 / per_mm:g}; correct one of them"
-            )
-        max_um = travel_mm * 1000 if table.max_um is None else table.max_um
-        speed_um_s = board[110] / 60 * 1000
-        for name, wanted, code, has in (
-            ("max_um", max_um, 130, travel_mm * 1000),
-            ("max_speed_um_s", table.max_speed_um_s or speed_um_s, 110, speed_um_s),
-        ):
-            if wanted > has * (1 + 1e-6):
-                raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${code} allows {has:g}; change one of them")
-        acceleration = board[120] * 1000
-        if table.acceleration_um_s2 is not None and abs(table.acceleration_um_s2 / acceleration - 1) > 1e-3:
-            raise ConfigError(
-                f"lens.acceleration_um_s2 is {table.acceleration_um_s2:g}, the board's $120 makes {acceleration:g}; "
-                "leave the key out, or change $120"
-            )
-        speed = table.max_speed_um_s or speed_um_s
-        self._limits = limits_from(1000 / per_mm, table.min_um, max_um, speed, acceleration)
-        self._steps_per_mm, self._travel_mm = per_mm, travel_mm
 
     def _new_trajectory(self) -> Trajectory:
         sigma_ns = round(self._settings.latency_sigma_us * NS_PER_US)

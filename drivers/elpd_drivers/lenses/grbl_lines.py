@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
 MAX_LINE = 512
 ERROR_WORDS = {
     "1": "expected a letter",
