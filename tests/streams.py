@@ -21,7 +21,12 @@ def evt3_words() -> Any:
     kinds = st.sampled_from([0x0, 0x2, 0x2, 0x3, 0x4, 0x4, 0x5, 0x6, 0x6, 0x8, 0xA, 0xE, 0xF, 0xF, 0x7, 0x1, 0x9, 0xB])
     plain = st.tuples(kinds, content).map(lambda w: w[0] << 12 | w[1])
     wrap = st.sampled_from([0x8000, 0x8FFF, 0x8800, 0x87FF, 0x9999, 0xE014, 0xE016])
-    words = st.lists(st.one_of(plain, wrap, st.integers(0, 0xFFFF)), max_size=300)
+    one = st.one_of(plain, wrap, st.integers(0, 0xFFFF)).map(lambda word: [word])
+    counts = st.tuples(st.sampled_from([0xE014, 0xE016]), content, content, content).map(
+        lambda c: [c[0], 0xF000 | c[1], 0xF000 | c[2], 0x7000 | c[3]]
+    )
+    phrases = st.one_of(one, one, one, counts, counts.map(lambda words: words[:-1]))
+    words = st.lists(phrases, max_size=150).map(lambda parts: [word for part in parts for word in part])
     return st.one_of(words, words.map(lambda rest: [0x8001, 0x0005, *rest]))
 
 

@@ -1,14 +1,14 @@
 """How fast are our kernels beside others', on a real recording: ``tools/throughput.py FILE [--json]``.
 
-Absolute speeds on a shared machine mean little, so what counts here are ratios within a round: every contender runs once
-per round, interleaved, over the same bytes, timed by the CPU time of its thread; a ratio is the median over rounds. The
-recording's payload is tiled to a useful size, with TIME_HIGH rewritten so that time goes on and no decoder sees a jump.
-A memcpy of the same bytes runs along, as the measure of the machine. Contenders get the stream in 128 KiB pieces, as a
-camera's USB transfers would bring it, except those that can only read files.
+Absolute speeds on a shared machine mean little, so what counts here are ratios within a round: every contender runs
+once per round, interleaved, over the same bytes, timed by the CPU time of its thread; a ratio is the median over
+rounds. The recording's payload is tiled to a useful size, with TIME_HIGH rewritten so that time goes on and no
+decoder sees a jump. A memcpy of the same bytes runs along, as the measure of the machine. Contenders get the stream
+in 128 KiB pieces, as a camera's USB transfers would bring it, except those that can only read files.
 
 The event-frame contender does what the field's scripts do, from bytes to the same numbers: decode (by the ``evt3``
-package), build a frame per 1 ms window, multiply by the weights, sum. It is slow, so it runs on the stream's beginning
-and is compared by bytes per second.
+package), build a frame per 1 ms window, multiply by the weights, sum. It is slow, so it runs on the stream's
+beginning and is compared by bytes per second.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import json
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -246,7 +247,7 @@ def _event_frames(decoder: Any, data: bytes, weights: NDArray[np.int64]) -> list
     sign = np.where(np.asarray(events.p) == 1, 1.0, -1.0)
     edges = np.searchsorted(t, np.arange(t[0], t[-1] + WINDOW_US, WINDOW_US))
     elp = []
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges.tolist()):
         frame = np.bincount(pixel[begin:end], sign[begin:end], minlength=weights.size)
         elp.append(-float(np.dot(frame, weights.reshape(-1))))
     return elp

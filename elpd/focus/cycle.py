@@ -237,7 +237,7 @@ class FocusCycle:
             reference,
             roi,
             geometry,
-            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um),
+            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=self.map is None),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
         )
@@ -255,12 +255,14 @@ class FocusCycle:
             raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
+        turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
         self._stage.listener = None
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
+        turned_at_um: float | None = None
         while True:
             self._details["sweep_sign"] = sign
             plan = SweepPlan(
@@ -268,9 +270,11 @@ class FocusCycle:
                 speed_um_s=speed_um_s,
                 max_travel_um=reach_um,
                 braking_um=braking_um,
+                turn_s=turn_s,
                 deadline_ns=self._deadline_ns,
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
+                turned_at_um=turned_at_um,
             )
             self._phase(Phase.SWEEP, sign=sign, position_um=self._here_um())
             report = sweep.run(plan)
@@ -296,6 +300,7 @@ class FocusCycle:
                     f"focus seemed to lie behind {self._reversals + 1} times; "
                     "does the subject move in depth? raise focus.max_reversals or hold it still",
                 )
+            turned_at_um = self._here_um() if report.end is SweepEnd.BEHIND else None
             if report.end is SweepEnd.RULE:
                 self._stage.rest(REST_LIMIT_MS)
             self._reversals += 1

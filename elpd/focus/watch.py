@@ -17,11 +17,23 @@ import numpy as np
 from elpd.events.stream import PacketDecoder
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, SYSTEMATIC_FRAMES, EventStretch, Witness, ask_events, fuse
-from elpd.vision.detector import Detector, RestingRate
+from elpd.vision.crossing import (
+    FLANK,
+    LAG_UNEXPLAINED,
+    ROI_MARGIN_PX,
+    UNMEASURED_LAG_US,
+    WIDTHS_PER_DEPTH_OF_FOCUS,
+    EventStretch,
+    Witness,
+    ask_events,
+    frame_witness,
+    fuse,
+)
+from elpd.vision.detector import SIGMAS, Detector, RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.filters import PixelCap
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.refractory import refractory_period_us
 from elpd.vision.track import EventEnergy, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -42,6 +54,16 @@ TICKS_PER_DEPTH_OF_FOCUS = 4
 LOOK_BACK_DOF = 12.0
 """The curve of sharpness is drawn this far back from the stop: a peak is five depths of focus wide."""
 
+LAG_UNEXPLAINED_BY_MAP = 0.15
+"""Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
+saturation, says which pixels are slow."""
+
+FAR_DROP = 0.6
+"""How far down the far side of the peak the witnesses look, in log S: about as far as the flank this side."""
+
+SIGMAS_AFTER_REVERSAL = 9.0
+"""A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
+
 SLOW_SHARE = 0.2
 """Windows with less than this share of the planned travel say little: the lens starts, stops or turns."""
 
@@ -60,6 +82,8 @@ class WatchSettings:
 
     speed_um_s: float
     depth_of_focus_um: float
+    frames: bool = False
+    """Whether the reference is a frame, whose bright and dark are blurred, and not a temporal map."""
 
 
 class Watch:
@@ -105,6 +129,8 @@ class Watch:
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
+        self._fine_windows: ElpWindows | None = None
+        self._fine_detector = Detector()
         self._decoder = PacketDecoder(geometry)
         self._kept: deque[CameraPacket] = deque()
         self._kept_bytes = 0
@@ -112,6 +138,7 @@ class Watch:
         self._last_us = SensorUs(0)
         self._sign = 1
         self._begun_us = SensorUs(0)
+        self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
         self._frames: list[Frame] = []
         self.decided_us: SensorUs | None = None
@@ -142,16 +169,25 @@ class Watch:
         """Events per second that the region sends at rest."""
         return 1e6 * self._rest.events_per_us
 
-    def begin(self, sign: int, at_us: SensorUs) -> None:
-        """Begin a direction of travel: everything is judged afresh."""
+    def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
+        """Begin a direction of travel: everything is judged afresh.
+
+        *turned_at_um* is where a reversal was commanded. Until the lens has come back there the events say more about
+        the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
+        the verdict that led here was certain, so the opposite one must be more certain still.
+        """
         for packet in self._kept:  # the decoder's registers must not miss what lies between the directions
             self._decoder.feed(packet)
         self._kept.clear()
         self._kept_bytes = 0
         if self._windows is None:
-            self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
-        self._detector = Detector(self._rest)
+            options: dict[str, Any] = {"window_us": self._window_us, "rate_cap": True}
+            self._windows = ElpWindows(self._reference.weights, self._inside, **options)
+            self._fine_windows = ElpWindows(self._reference.fine, self._inside, **options)
+        self._detector = Detector(self._rest, recede_sigmas=SIGMAS if turned_at_um is None else SIGMAS_AFTER_REVERSAL)
+        self._fine_detector = Detector()
         self._sign = sign
+        self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
         self._samples = []
         self._frames = []
@@ -162,18 +198,23 @@ class Watch:
     def feed(self, packet: CameraPacket) -> list[ElpSample]:
         """Judge one packet; return the windows it closed."""
         assert self._windows is not None, "begin() comes before feed()"
+        assert self._fine_windows is not None
         self.keep(packet)
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
-        for row in self._windows.feed(packet):
+        fine_rows = self._fine_windows.feed(packet)
+        for row, fine in zip(self._windows.feed(packet), fine_rows, strict=True):
             sample = self._located(row)
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
+            if self._sign * sample.position_um < self._judge_from:
+                continue
             self._detector.feed(sample)
-            if self._detector.mutation is not None and self.decided_us is None:
+            self._fine_detector.feed(replace(sample, elp=int(fine["elp"]), energy=int(fine["energy"])))
+            if self.passed and self.decided_us is None:
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
         self.events_in_cycle += sum(sample.n_on + sample.n_off for sample in samples)
@@ -197,8 +238,14 @@ class Watch:
 
     @property
     def passed(self) -> bool:
-        """Whether the sign mutation is certain: focus has been passed."""
-        return self._detector.mutation is not None
+        """Whether the sign mutation is certain: focus has been passed.
+
+        The fine weights see it first, near focus; they have no say before the coarse ones know that focus was ahead,
+        because far from focus a lens inverts fine contrast.
+        """
+        if self._detector.mutation is not None:
+            return True
+        return self._detector.direction is Direction.APPROACHING and self._fine_detector.mutation is not None
 
     @property
     def direction(self) -> Direction:
@@ -224,14 +271,14 @@ class Watch:
         track = self._draw(stretch)
         if track is None:
             return None
+        peak_um, end_um = track.positions[track.peak], self._far_side(track)
         said = ask_events(
-            stretch,
-            track.positions[track.flank(FLANK)],
-            track.positions[track.peak],
-            track.positions[-1],
-            self._brightness(),
+            _until(stretch, end_um), track.positions[track.flank(FLANK)], peak_um, end_um, self._brightness()
         )
-        found = fuse([*self._ask_frames(), *said.witnesses()])
+        unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
+        unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
+        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
+        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um, unexplained, width_um)])
         if found is None:
             return None
         sign = self._sign
@@ -257,7 +304,7 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
-        for row in self._windows.feed(packet):
+        for row in self._windows.feed(packet):  # fine windows rest: they are not judged any more
             self.events_in_cycle += int(row["n_on"] + row["n_off"])
 
     # --- pieces ---
@@ -282,6 +329,8 @@ class Watch:
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
+        if self._fine_windows is not None:
+            self._fine_windows.set_weights(self._reference.fine, self._inside)
 
     def _stretch(self) -> EventStretch | None:
         """Decode the kept packets: the region's events while the lens moved the right way, on its path."""
@@ -306,12 +355,14 @@ class Watch:
         t_us = np.ascontiguousarray(t_us[keep])
         if t_us.size < MIN_EVENTS:
             return None
+        x, y = x[keep].astype(np.uint16), y[keep].astype(np.uint16)
+        deaf_us = refractory_period_us(t_us, x, y, (height, width))
         return EventStretch(
             t_us,
-            x[keep].astype(np.uint16),
-            y[keep].astype(np.uint16),
+            x,
+            y,
             on[keep].astype(np.uint8),
-            self._sign * self._path(t_us),
+            self._sign * self._path(t_us + round(deaf_us)),
             height,
             width,
             ROI_MARGIN_PX,
@@ -358,6 +409,15 @@ class Watch:
             track.add(int(stretch.t_us[max(0, taken - 1)]), float(tick_um), energy.measure())
         return track if track.positions[track.peak] > track.positions[track.flank(FLANK)] else None
 
+    @staticmethod
+    def _far_side(track: PeakTrack) -> float:
+        """Return where the far side of the peak has said enough: what comes later only blurs the answer."""
+        top = track.values[track.peak]
+        for value, position in zip(track.values[track.peak :], track.positions[track.peak :], strict=True):
+            if value < top - FAR_DROP:
+                return position
+        return track.positions[-1]
+
     def _ask_frames(self) -> list[Witness]:
         """Ask the frames of this sweep, where three or more saw focus come and go."""
         track = PeakTrack()
@@ -368,7 +428,7 @@ class Watch:
         vertex = track.vertex() if track.passed else None
         if vertex is None:
             return []
-        return [Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * vertex.width)))]
+        return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]
 
     def _brightness(self) -> NDArray[np.float32]:
         roi, geometry = self._roi, self._geometry
@@ -376,3 +436,16 @@ class Watch:
         right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         return np.ascontiguousarray(self._reference.brightness[top:bottom, left:right])
+
+
+def _until(stretch: EventStretch, end_um: float) -> EventStretch:
+    """Cut a stretch off at a position."""
+    count = int(np.searchsorted(stretch.position, end_um, side="right"))
+    return replace(
+        stretch,
+        t_us=stretch.t_us[:count],
+        x=stretch.x[:count],
+        y=stretch.y[:count],
+        on=stretch.on[:count],
+        position=stretch.position[:count],
+    )

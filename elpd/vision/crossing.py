@@ -129,23 +129,28 @@ class EventWitnesses:
     pairs: Mode | None
     lag: Lag
 
-    def witnesses(self, unmeasured_lag: float = 0.0) -> list[Witness]:
+    def witnesses(
+        self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
+    ) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
 
-        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured:
-        ``UNMEASURED_LAG_US`` times the speed.
+        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured, *unexplained* the
+        share of a measured one that may be wrong. *width* is the curve's own, where it is known beforehand; without
+        it, pairs are believed only beside a vertex.
         """
         found: list[Witness] = []
-        if self.vertex is None:
+        if self.vertex is None and width is None:
             return found
-        width = self.vertex.width
+        width = width if width is not None or self.vertex is None else self.vertex.width
+        assert width is not None
         shared = unmeasured_lag
         if self.lag.sigma > 0.0:
-            shared = self.lag.typical * float(np.hypot(LAG_UNEXPLAINED * self.lag.at, self.lag.sigma))
+            shared = self.lag.typical * float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
         stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
-        sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
-        found.append(Witness("vertex", self.vertex.at, sigma, shared))
+        if self.vertex is not None:
+            sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
+            found.append(Witness("vertex", self.vertex.at, sigma, shared))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
             sigma = float(np.hypot(self.pairs.sigma, (SYSTEMATIC_PAIRS + stray) * width))
             found.append(Witness("pairs", self.pairs.at, sigma, shared))

@@ -63,10 +63,15 @@ class Detector:
         What the region says at rest; its mean is subtracted.
     arm_after_us:
         Samples that begin earlier are settling, and are not judged.
+    recede_sigmas:
+        How certain a first verdict of receding must be: more after a reversal, because a false one costs the most.
     """
 
-    def __init__(self, rest: RestingRate | None = None, arm_after_us: int = 0) -> None:
+    def __init__(
+        self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS
+    ) -> None:
         self.rest = rest or RestingRate()
+        self.recede_sigmas = recede_sigmas
         self.arm_after_us = arm_after_us
         self.direction = Direction.UNKNOWN
         self.first: Verdict | None = None
@@ -180,7 +185,7 @@ class Detector:
         elif (
             self.direction is not Direction.RECEDING
             and self._events_since_high >= _MIN_EVENTS_FOR_VERDICT
-            and self.recede_score > SIGMAS
+            and self.recede_score > (self.recede_sigmas if self.direction is Direction.UNKNOWN else SIGMAS)
             and (self.direction is Direction.UNKNOWN or drawdown > RELATIVE_DRAWDOWN * (self._high - self._foot))
         ):
             score = self.recede_score

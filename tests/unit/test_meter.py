@@ -20,7 +20,7 @@ WEIGHTS = np.random.default_rng(1).integers(-2000, 2000, (6, 7)).astype(np.int16
 
 
 def reference() -> Any:
-    return Reference(WEIGHTS, 100.0, 1.0, np.ones(WEIGHTS.shape, np.float32))
+    return Reference(WEIGHTS, 100.0, 1.0, np.ones(WEIGHTS.shape, np.float32), WEIGHTS)
 
 
 @st.composite
