@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import CameraError, DeviceError, UsageError
 from elpd.focus import safety
-from elpd.focus.expose import expose
+from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
 from elpd.focus.stage import Stage
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
@@ -48,6 +48,9 @@ BIAS_SETTLE_MS = 10.0
 
 FRAME_LIMIT_MS = 500.0
 """A camera with frames delivers one within this, or has none."""
+
+REJOG_S = 0.25
+"""What a controller without a velocity mode takes from one jog to the opposite one, beside braking."""
 
 REST_LIMIT_MS = 1500.0
 """No lens this is for rings or brakes longer; past it the lens does not obey."""
@@ -180,10 +183,12 @@ class FocusCycle:
     def _picture(self) -> Picture:
         """Get a picture of the scene: a stored one, an opening aperture's, or the newest frame."""
         request, geometry = self._request, self._parts.camera.geometry
-        if request.stored_map is not None:
-            return Picture.of_map(request.stored_map)
         if request.reference is not None:
-            return Picture.of_file(request.reference, geometry)
+            picture = Picture.of_file(request.reference, geometry)
+            if self._parts.aperture is not None:
+                self._parts.aperture.open()
+                self._stage.wait_ms(AFTER_FACTOR * self._parts.aperture.opening_ms)
+            return picture
         if self._parts.aperture is None:
             frame = self._stage.newest_frame(FRAME_LIMIT_MS)
             if frame is None:
@@ -256,6 +261,8 @@ class FocusCycle:
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
         turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
+        if not capabilities.native_velocity:
+            turn_s += REJOG_S
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
         self._stage.listener = None

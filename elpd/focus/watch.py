@@ -342,15 +342,15 @@ class Watch:
         while self._kept:
             events = self._decoder.feed(self._kept.popleft())
             inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-            parts.append(
-                (events.t[inside], events.x[inside] - left, events.y[inside] - top, events.p[inside])
-            )
+            parts.append((events.t[inside], events.x[inside] - left, events.y[inside] - top, events.p[inside]))
         self._kept_bytes = 0
         if not parts:
             return None
         t_us, x, y, on = (np.concatenate(column) for column in zip(*parts, strict=True))
         height, width = bottom - top, right - left
         moving = self._moving(t_us)
+        if self.decided_us is not None:  # a motor that brakes late goes far beyond what is of interest
+            moving &= t_us <= self.decided_us
         keep = PixelCap(height, width).keep(t_us, x.astype(np.uint16), y.astype(np.uint16)) & moving
         t_us = np.ascontiguousarray(t_us[keep])
         if t_us.size < MIN_EVENTS:

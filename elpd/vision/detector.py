@@ -65,9 +65,7 @@ class Detector:
         How certain a first verdict of receding must be: more after a reversal, because a false one costs the most.
     """
 
-    def __init__(
-        self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS
-    ) -> None:
+    def __init__(self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS) -> None:
         self.rest = rest or RestingRate()
         self.recede_sigmas = recede_sigmas
         self.arm_after_us = arm_after_us
