@@ -37,7 +37,7 @@ from elpd.vision.elp_windows import (
     OUTSIDE,
     move_to,
 )
-from elpd.vision.elp_words import DEPTH_US, REFILL_US, store_sums
+from elpd.vision.elp_words import DEPTH_US, REFILL_US, add_indexed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,21 +68,19 @@ def add_event(
     """Add one event to the open window."""
     last_row = table.shape[0] // STRIDE - 1
     index = np.uint64(min(y, last_row) * STRIDE + min(x, MAX_SIDE))
-    weight = np.int64(table[index])
-    if weight <= OUTSIDE_WEIGHT:
-        window[OUTSIDE] += 1
-        window[OUT_OF_SENSOR] += weight == OUT_OF_SENSOR_WEIGHT
-        return
-    if capped:
-        ready = max(bucket[index], t)
-        if ready - t > DEPTH_US:
-            window[N_CAPPED] += 1
-            return
-        bucket[index] = ready + REFILL_US
-    window[ELP] += (weight ^ -on) + on
-    window[ENERGY] += weight * weight
-    window[N_ON] += on
-    window[N_OFF] += 1 - on
+    add_indexed(t, index, on, capped, table, window, bucket)
+
+
+@kernel()
+def store_sums(
+    window: NDArray[np.int64], elp: Integer, energy: Integer, n_on: Integer, n: Integer, n_capped: Integer
+) -> None:
+    """Put the sums of the open window back where they are kept."""
+    window[ELP] = elp
+    window[ENERGY] = energy
+    window[N_ON] = n_on
+    window[N_OFF] = n - n_on
+    window[N_CAPPED] = n_capped
 
 
 def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
