@@ -150,10 +150,36 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
             word = np.int64(words[i])
             i += np.uint64(1)
             kind = word >> 12
+            if kind == 0x8:
+                content = word & 0xFFF
+                high = (base >> 12) & 0xFFF
+                if content == high:
+                    continue
+                if high >= 2048 + content:
+                    base += 1 << 24
+                base += (content - high) << 12
+                word = np.int64(0)
+                kind = np.int64(0x6)
+            # What mostly follows is taken at once: after a time a row, after a row a column.
+            if kind == 0x6:
+                t = base + (word & 0xFFF)
+                if np.uint64(t - begin) >= length:
+                    sum_pending(pending, np.int64(n), table, window)
+                    n = np.uint64(0)
+                    paused = not move_to(t, window, edges, rows)
+                    begin, length = window[BEGIN], np.uint64(window[LENGTH])
+                    if paused:
+                        break
+                if i == size:
+                    break
+                word = np.int64(words[i])
+                if word >> 12 != 0x0:
+                    continue
+                i += np.uint64(1)
+                kind = np.int64(0x0)
             if kind == 0x0:
                 state[ROW] = word
                 offset = min(word, last_row) * STRIDE
-                # Nearly every row word is followed by a column: no need to ask what it is twice.
                 if i == size:
                     break
                 word = np.int64(words[i])
@@ -170,22 +196,11 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
                     pending[n] = index << 1 | on
                     n += np.uint64(1)
                 continue
-            if kind == 0x6:
-                t = base + (word & 0xFFF)
-            elif kind == 0x8:
-                content = word & 0xFFF
-                high = (base >> 12) & 0xFFF
-                if content == high:
-                    continue
-                if high >= 2048 + content:
-                    base += 1 << 24
-                base += (content - high) << 12
-                t = base
-            elif kind == 0x3:
+            if kind == 0x3:
                 state[VECTOR_X] = word & 0x7FF
                 state[VECTOR_ON] = (word >> 11) & 1
                 continue
-            elif kind in (0x4, 0x5):
+            if kind in (0x4, 0x5):
                 vector_x, vector_on = state[VECTOR_X], state[VECTOR_ON]
                 mask = np.uint32(word & 0xFFF if kind == 0x4 else word & 0xFF)
                 while mask != 0:
@@ -199,16 +214,7 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
                 # A base outside every sensor need not grow: it would overflow in the end.
                 state[VECTOR_X] = min(vector_x + (12 if kind == 0x4 else 8), 2 * MAX_SIDE)
                 continue
-            else:
-                i = take_rare_words(words, i, t, state, triggers)
-                continue
-            if np.uint64(t - begin) >= length:
-                sum_pending(pending, np.int64(n), table, window)
-                n = np.uint64(0)
-                paused = not move_to(t, window, edges, rows)
-                begin, length = window[BEGIN], np.uint64(window[LENGTH])
-                if paused:
-                    break
+            i = take_rare_words(words, i, t, state, triggers)
         sum_pending(pending, np.int64(n), table, window)
         state[LOOP], state[HIGH], state[LOW] = base >> 24, (base >> 12) & 0xFFF, t - base
         if not paused:
