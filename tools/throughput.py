@@ -148,7 +148,7 @@ def _contenders(
     else:
         beginning = _beginning(words, geometry)
         size = (geometry.width, geometry.height)
-        contenders["evt3 decode"] = (lambda: feed(evt3.Decoder(*size), as_bytes), words.nbytes)
+        contenders["evt3 decode"] = (lambda: feed(evt3.Decoder(*size), as_bytes), words)
         contenders["evt3 + numpy event frame"] = (
             lambda: lambda: _event_frames(evt3.Decoder(*size), beginning.tobytes(), weights),
             beginning,
