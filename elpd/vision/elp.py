@@ -103,7 +103,7 @@ class ElpWindows:
         self._triggers = new_triggers()
         self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
-        self._pending = np.zeros(elp_words.PENDING, np.uint32)
+        self._pending = (np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64))
         self._words = (
             {
                 Encoding.EVT3: elp_words.evt3_to_windows_capped,
@@ -174,7 +174,7 @@ class ElpWindows:
         if packet.encoding is Encoding.ARRAY:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
         sum_words = self._words[packet.encoding]
-        scratch = (self._bucket, self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
+        scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
         words = packet.data
         window = self._window
         window[N_ROWS] = 0

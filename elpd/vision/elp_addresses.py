@@ -37,7 +37,7 @@ from elpd.vision.elp_windows import (
     OUTSIDE,
     move_to,
 )
-from elpd.vision.elp_words import DEPTH_US, REFILL_US, add_indexed
+from elpd.vision.elp_words import DEPTH_US, REFILL_US
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,7 +68,21 @@ def add_event(
     """Add one event to the open window."""
     last_row = table.shape[0] // STRIDE - 1
     index = np.uint64(min(y, last_row) * STRIDE + min(x, MAX_SIDE))
-    add_indexed(t, index, on, capped, table, window, bucket)
+    weight = np.int64(table[index])
+    if weight <= OUTSIDE_WEIGHT:
+        window[OUTSIDE] += 1
+        window[OUT_OF_SENSOR] += weight == OUT_OF_SENSOR_WEIGHT
+        return
+    if capped:
+        ready = max(bucket[index], t)
+        if ready - t > DEPTH_US:
+            window[N_CAPPED] += 1
+            return
+        bucket[index] = ready + REFILL_US
+    window[ELP] += (weight ^ -on) + on
+    window[ENERGY] += weight * weight
+    window[N_ON] += on
+    window[N_OFF] += 1 - on
 
 
 @kernel()

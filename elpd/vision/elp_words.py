@@ -14,7 +14,7 @@ pipeline.)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -52,7 +52,7 @@ PENDING = 12 * (BLOCK_WORDS + 4)
 
 SIGNATURE = (
     f"int64({WORDS}, int64, int64[::1], int64[:, ::1], "
-    "int16[::1], int64[::1], int64[::1], int64[:, ::1], int64, int64[::1], uint32[::1])"
+    "int16[::1], int64[::1], int64[::1], int64[:, ::1], int64, int64[::1], uint32[::1], int64[::1])"
 )
 
 
@@ -83,31 +83,60 @@ def sum_pending(pending: NDArray[np.uint32], n: Integer, table: NDArray[np.int16
 
 
 @kernel()
-def add_indexed(
-    t: Integer,
-    index: Any,
-    on: Integer,
-    capped: bool,  # noqa: FBT001  (a constant of the caller)
+def sum_capped(
+    pending: NDArray[np.uint32],
+    pending_us: NDArray[np.int64],
+    n: Integer,
     table: NDArray[np.int16],
     window: NDArray[np.int64],
     bucket: NDArray[np.int64],
 ) -> None:
-    """Add one event, by its table index, to the open window, unless its pixel has had too many of late."""
-    weight = np.int64(table[index])
-    if weight <= OUTSIDE_WEIGHT:
-        window[OUTSIDE] += 1
-        window[OUT_OF_SENSOR] += weight == OUT_OF_SENSOR_WEIGHT
-        return
-    if capped:
+    """As ``sum_pending``, refusing the events of pixels that have had too many of late."""
+    elp = np.int64(0)
+    energy = np.int64(0)
+    n_inside = np.int64(0)
+    n_on = np.int64(0)
+    n_capped = np.int64(0)
+    for i in range(n):
+        index = np.uint64(pending[i] >> np.uint32(1))
+        weight = np.int64(table[index])
+        if weight <= OUTSIDE_WEIGHT:
+            window[OUTSIDE] += 1
+            window[OUT_OF_SENSOR] += weight == OUT_OF_SENSOR_WEIGHT
+            continue
+        t = pending_us[i]
         ready = max(bucket[index], t)
         if ready - t > DEPTH_US:
-            window[N_CAPPED] += 1
-            return
+            n_capped += 1
+            continue
         bucket[index] = ready + REFILL_US
-    window[ELP] += (weight ^ -on) + on
-    window[ENERGY] += weight * weight
-    window[N_ON] += on
-    window[N_OFF] += 1 - on
+        on = np.int64(pending[i] & np.uint32(1))
+        elp += (weight ^ -on) + on
+        energy += weight * weight
+        n_inside += 1
+        n_on += on
+    window[ELP] += elp
+    window[ENERGY] += energy
+    window[N_ON] += n_on
+    window[N_OFF] += n_inside - n_on
+    window[N_CAPPED] += n_capped
+
+
+@kernel()
+def sum_block(
+    capped: bool,  # noqa: FBT001  (a constant of the caller)
+    pending: NDArray[np.uint32],
+    pending_us: NDArray[np.int64],
+    n: Integer,
+    table: NDArray[np.int16],
+    window: NDArray[np.int64],
+    bucket: NDArray[np.int64],
+) -> None:
+    """Add the *n* events of a block to the open window."""
+    if capped:
+        sum_capped(pending, pending_us, n, table, window, bucket)
+    else:
+        sum_pending(pending, n, table, window)
 
 
 def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one function: calls cost)
@@ -124,6 +153,7 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
         complete_until_us: int,
         bucket: NDArray[np.int64],
         pending: NDArray[np.uint32],
+        pending_us: NDArray[np.int64],
     ) -> int:
         if state[HIGH] < 0:
             position = skip_to_time(words, position, state)
@@ -144,7 +174,7 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
         n = np.uint64(0)
         while i < size:
             if i >= block_end:
-                sum_pending(pending, np.int64(n), table, window)
+                sum_block(capped, pending, pending_us, np.int64(n), table, window, bucket)
                 n = np.uint64(0)
                 block_end = i + np.uint64(BLOCK_WORDS)
             word = np.int64(words[i])
@@ -164,7 +194,7 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
             if kind == 0x6:
                 t = base + (word & 0xFFF)
                 if np.uint64(t - begin) >= length:
-                    sum_pending(pending, np.int64(n), table, window)
+                    sum_block(capped, pending, pending_us, np.int64(n), table, window, bucket)
                     n = np.uint64(0)
                     paused = not move_to(t, window, edges, rows)
                     begin, length = window[BEGIN], np.uint64(window[LENGTH])
@@ -190,11 +220,10 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
             if kind == 0x2:
                 index = offset + (word & 0x7FF)
                 on = (word >> 11) & 1
+                pending[n] = index << 1 | on
                 if capped:
-                    add_indexed(t, np.uint64(index), on, capped, table, window, bucket)
-                else:
-                    pending[n] = index << 1 | on
-                    n += np.uint64(1)
+                    pending_us[n] = t
+                n += np.uint64(1)
                 continue
             if kind == 0x3:
                 state[VECTOR_X] = word & 0x7FF
@@ -206,16 +235,15 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one
                 while mask != 0:
                     index = offset + min(vector_x + np.int64(trailing_zeros(mask)), MAX_SIDE)
                     mask = np.uint32(mask & (mask - np.uint32(1)))
+                    pending[n] = index << 1 | vector_on
                     if capped:
-                        add_indexed(t, np.uint64(index), vector_on, capped, table, window, bucket)
-                    else:
-                        pending[n] = index << 1 | vector_on
-                        n += np.uint64(1)
+                        pending_us[n] = t
+                    n += np.uint64(1)
                 # A base outside every sensor need not grow: it would overflow in the end.
                 state[VECTOR_X] = min(vector_x + (12 if kind == 0x4 else 8), 2 * MAX_SIDE)
                 continue
             i = take_rare_words(words, i, t, state, triggers)
-        sum_pending(pending, np.int64(n), table, window)
+        sum_block(capped, pending, pending_us, np.int64(n), table, window, bucket)
         state[LOOP], state[HIGH], state[LOW] = base >> 24, (base >> 12) & 0xFFF, t - base
         if not paused:
             move_to(max(t, complete_until_us), window, edges, rows)
