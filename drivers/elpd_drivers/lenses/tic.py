@@ -15,7 +15,7 @@ The time at which a position was sampled lies between the query's last byte on t
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
@@ -23,7 +23,15 @@ from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
 from elpd_drivers.lenses import tic_wire as wire
-from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, read_settings, run_target
+from elpd_drivers.lenses.axis import (
+    ADAPTER_LATENCY_SIGMA_US,
+    ADAPTER_LATENCY_US,
+    check_speed,
+    check_target,
+    limits_from,
+    read_settings,
+    run_target,
+)
 from elpd_drivers.lenses.tic_wire import crc7, encode, long_word, parse_reply, reply_length
 
 if TYPE_CHECKING:
@@ -39,7 +47,8 @@ class TicSettings:
     """The table ``[lens]`` for a Tic.
 
     ``latency_us`` is the usual time from a command's last bit to its effect, adapter included, and
-    ``latency_sigma_us`` how well that is known. ``start_stop_um_s`` is the speed from which the motor can halt without
+    ``latency_sigma_us`` how well that is known. Unless given, a real port gets what USB adapters need, which is wider.
+    ``start_stop_um_s`` is the speed from which the motor can halt without
     losing steps. ``crc`` must be what the Tic's own settings say.
     """
 
@@ -71,6 +80,8 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
         from elpd_drivers.lenses.serial_port import SerialPort  # noqa: PLC0415  (needs pyserial, in-memory use does not)
 
         port = SerialPort(table.port, table.baud)
+        if "latency_us" not in settings:
+            table = replace(table, latency_us=ADAPTER_LATENCY_US, latency_sigma_us=ADAPTER_LATENCY_SIGMA_US)
     lens = TicLens(table, clock, port)
     try:
         lens.connect()
@@ -115,7 +126,7 @@ class TicLens:
         self._halted_softly = False
         self._speed_word = -1
         self._rest_due_ns: int | None = None
-        self._stops_ignored = 0
+        self._stops = self._stops_ignored = 0
         self._implausible = 0
         self._fault: str | None = None
         self._stop_bytes = {
@@ -200,15 +211,17 @@ class TicLens:
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move."""
+        stops = self._stops
         self._check_fault()
         check_target(target, self._limits)
         check_speed(speed_sps, self._limits)
         if not self._referenced:
             raise LensError(f"lens: cannot move to {target} steps, its position is unknown; home it first")
-        return self._go(target, abs(speed_sps), "move_to")
+        return self._go(target, abs(speed_sps), "move_to", stops)
 
     def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
         """Run at a signed velocity, ending at *until* or the limit: a target position that says both."""
+        stops = self._stops
         self._check_fault()
         check_speed(velocity_sps, self._limits)
         with self._lock:
@@ -217,10 +230,11 @@ class TicLens:
             moving_sps = self._trajectory.velocity_at(now)
         spare_ns = until - now - self._latency_ns - 3 * self._sigma_ns - 14 * self._byte_ns
         target = run_target(steps, moving_sps, velocity_sps, spare_ns, self._limits, referenced=self._referenced)
-        return self._go(target, abs(velocity_sps), "run")
+        return self._go(target, abs(velocity_sps), "run", stops)
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte(s) now, from any thread; the books are kept afterwards."""
+        self._stops += 1
         data = self._stop_bytes[mode]
         begun = self._clock.now_ns()
         self._write(data)
@@ -260,7 +274,7 @@ class TicLens:
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
-    def _go(self, target: int, speed_sps: float, name: str) -> CommandStamp:
+    def _go(self, target: int, speed_sps: float, name: str, stops: int) -> CommandStamp:
         self._prepare()
         word = max(1, round(speed_sps * 10_000))
         data = b"" if word == self._speed_word else self._frame(wire.SET_MAX_SPEED, long_word(word))
@@ -276,6 +290,8 @@ class TicLens:
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 50 * NS_PER_MS
             self._halted_softly = False
             self._stops_ignored = 0
+        if self._stops != stops:
+            self.stop(StopMode.ABRUPT)  # one came from another thread while this was on its way: it wins
         return CommandStamp(name, begun, done)
 
     def _prepare(self) -> None:
