@@ -1,0 +1,325 @@
+"""A simulated rig, whole, wired by hand: the entry point ``elpd.rigs: sim``.
+
+One world holds a camera, an aperture and a lens behind its real wire protocol; the driver that moves the lens is that
+for real hardware. True focus is drawn over the lens's travel, and the lens begins referenced and at rest beside it.
+What a controller cannot know, the ``Truth`` does: where focus is and where the glass really came to rest.
+
+The two rulers differ by the play between motor and carriage. ``focus_um`` is given on the motor's ruler as it is while
+the carriage is pushed in the direction of the sweep (``result.details["sweep_sign"]``): carriage focus plus half the
+play for an upward sweep, minus half for a downward one. The final error is read off the carriage and needs no ruler.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from elpd.errors import ConfigError, LensError
+from elpd.events.evt3_encode import Evt3Encoder
+from elpd.ports import RigParts
+from elpd.records import Encoding, Geometry
+from elpd_drivers.lenses import grbl, tic
+from elpd_drivers.lenses.axis import read_settings
+from elpd_drivers.sim.aperture import SimulatedAperture
+from elpd_drivers.sim.boards.grbl import GrblBoard, GrblConfig
+from elpd_drivers.sim.boards.line import MemoryPort
+from elpd_drivers.sim.boards.tic import TicBoard, TicConfig
+from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, SimulatedCamera, Wire
+from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
+from elpd_drivers.sim.motion import SceneMotion
+from elpd_drivers.sim.optics import DefocusStack, LightField
+from elpd_drivers.sim.retina import ApsFrames, Retina
+from elpd_drivers.sim.scene import choose_scene, scene_canvas
+from elpd_drivers.sim.sensor import FOCUS, BiasLevels, EventSensor
+from elpd_drivers.sim.world import World, random_stream
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from elpd.ports import Lens
+    from elpd.records import FocusResult
+    from elpd_drivers.sim.sensor import Events
+
+MARGIN_PX = 32
+INTERPOLATION_PX = 3
+ROOM_UM = 300.0
+CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
+MASK_SLOTS = {"evk4": 64, "davis346": 8}
+BOARDS = ("tic", "grbl")
+
+
+@dataclass(frozen=True, slots=True)
+class SimSettings:
+    """The table ``[sim]``. Everything random follows from ``seed``.
+
+    ``start_um`` is where the lens begins, relative to true focus. ``scene`` is a name or ``random``, one of the natural
+    pictures by seed. ``speed_um_s`` is what the sweep is meant to run at; the lens allows three times as much.
+    ``width`` and ``height`` shrink the sensor; 0 is the camera's own size. Rates are per pixel; ``brightness`` scales
+    the light, and with it photoreceptor lag and shot noise. The ``camera_*``, ``drop_*`` and ``aperture_stuck`` or
+    ``_slow`` keys inject faults, in seconds after the camera's start.
+    """
+
+    seed: int = 0
+    start_um: float = -200.0
+    scene: str = "random"
+    motion: str = "static"
+    board: str = "tic"
+    camera: str = "evk4"
+    depth_of_focus_um: float = 6.0
+    speed_um_s: float = 4000.0
+    pace: float = 0.0
+    width: int = 0
+    height: int = 0
+    # light
+    cap: bool = False
+    brightness: float = 1.0
+    flicker_hz: float = 0.0
+    flicker_depth: float = 0.1
+    # sensor
+    noise_hz: float = 1.0
+    leak_hz: float = 0.1
+    hot_pixels: int = 0
+    contrast_on: float = FOCUS.c_on
+    contrast_off: float = FOCUS.c_off
+    refractory_us: int = FOCUS.refractory_us
+    ring_packets: int = RING_PACKETS
+    # aperture
+    aperture_ms: float = 20.0
+    aperture_profile: str = "iris"
+    aperture_stuck: bool = False
+    aperture_slow: bool = False
+    # lens
+    travel_um: float = 2500.0
+    um_per_step: float = 0.3125
+    backlash_um: float = 4.0
+    acceleration_um_s2: float = 400_000.0
+    microstep_error_um: float = 0.0
+    # faults of the camera
+    camera_vanishes_at_s: float | None = None
+    camera_silent_from_s: float | None = None
+    drop_from_s: float | None = None
+    drop_for_s: float = 0.01
+
+
+class Evt3Wire:
+    """EVT3 words, each span closed by the time at its end."""
+
+    encoding = Encoding.EVT3
+
+    def __init__(self, width: int) -> None:
+        self._encoder = Evt3Encoder(width)
+
+    def encode(self, events: Events, begin_us: int, end_us: int) -> NDArray[Any]:
+        """Return a fresh array of uint16 words."""
+        del begin_us
+        words = self._encoder.encode(events.t_us, events.x, events.y, events.on).copy()
+        return np.concatenate([words, self._encoder.encode_time(end_us)])
+
+
+class SimulatedTruth:
+    """What only a simulated rig knows (``elpd.ports.Truth``), and its parts, for tests that reach in.
+
+    Parameters
+    ----------
+    focus_carriage_um
+        The carriage position of true focus, from the lower end stop.
+    """
+
+    def __init__(
+        self,
+        *,
+        world: World,
+        lens: Lens,
+        mechanism: SimulatedLens,
+        port: MemoryPort,
+        aperture: SimulatedAperture | None,
+        focus_carriage_um: float,
+        scene: str,
+    ) -> None:
+        self.world = world
+        self.mechanism = mechanism
+        self.port = port
+        self.aperture = aperture
+        self.focus_carriage_um = focus_carriage_um
+        self.scene = scene
+        self._lens = lens
+
+    def carriage_error_um(self) -> float:
+        """Return how far the carriage is from focus now, signed."""
+        now = np.array([self.world.now_ns()], np.int64)
+        return float(self.mechanism.carriage_um(now)[0]) - self.focus_carriage_um
+
+    def focus_um(self, sweep_sign: int) -> float | None:
+        """Return focus on the motor's ruler while the carriage is pushed in a direction (+1, -1; 0: mid-play).
+
+        The ruler is the driver's own count, so lost steps and a new reference are taken into account. ``None`` if the
+        driver does not know where it is.
+        """
+        now = self.world.now_ns()
+        try:
+            count = self._lens.position_at(now).steps
+        except LensError:
+            return None
+        mechanics = self.mechanism.mechanics
+        shift_um = round(count - self.mechanism.rotor_at(now)) * mechanics.um_per_step
+        return self.focus_carriage_um + sweep_sign * mechanics.backlash_um / 2 + shift_um
+
+    def errors(self, result: FocusResult) -> dict[str, float | None]:
+        """Return ``focus_um estimate_error_um stop_error_um final_error_um``; ``None`` where there is no number."""
+        focus_um = self.focus_um(int(result.details.get("sweep_sign", 0)))
+
+        def error(measured_um: float | None) -> float | None:
+            return None if measured_um is None or focus_um is None else measured_um - focus_um
+
+        return {
+            "focus_um": focus_um,
+            "estimate_error_um": error(result.focus_um),
+            "stop_error_um": error(result.stop_um),
+            "final_error_um": None if result.final_um is None else self.carriage_error_um(),
+        }
+
+
+def build_rig(settings: Mapping[str, Any]) -> RigParts:
+    """Build a simulated rig from the table ``[sim]``; see ``SimSettings`` for the keys.
+
+    Raises ``ConfigError`` for unknown keys, wrong types and impossible values.
+    """
+    chosen = read_settings(SimSettings, settings, "sim")
+    geometry = _geometry(chosen)
+    seed = chosen.seed
+    world = World(chosen.pace)
+    focus_um, start_um = _place(chosen)
+    mechanism = SimulatedLens(_mechanics(chosen), start_um=start_um)
+    lens, port = _lens(chosen, world, mechanism)
+    aperture = _aperture(chosen, world) if chosen.camera == "evk4" else None
+    scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
+    light = LightField(
+        DefocusStack(scene_canvas(scene, geometry.width, geometry.height, MARGIN_PX), chosen.brightness),
+        mechanism.carriage_um,
+        focus_um,
+        SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX),
+        aperture=aperture,
+        depth_of_focus_um=chosen.depth_of_focus_um,
+        margin_px=MARGIN_PX,
+        flicker_hz=chosen.flicker_hz,
+        flicker_depth=chosen.flicker_depth,
+        cap=chosen.cap,
+    )
+    truth = SimulatedTruth(
+        world=world,
+        lens=lens,
+        mechanism=mechanism,
+        port=port,
+        aperture=aperture,
+        focus_carriage_um=focus_um,
+        scene=scene,
+    )
+    return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, chosen.um_per_step, truth)
+
+
+def _geometry(chosen: SimSettings) -> Geometry:
+    if chosen.camera not in CAMERAS:
+        raise ConfigError(f"sim.camera is {chosen.camera!r}; known: {', '.join(CAMERAS)}")
+    full = CAMERAS[chosen.camera]
+    geometry = Geometry(chosen.width or full.width, chosen.height or full.height)
+    if not (16 <= geometry.width <= full.width and 16 <= geometry.height <= full.height):
+        raise ConfigError(
+            f"sim.width, sim.height are {geometry.width}, {geometry.height}; a simulated {chosen.camera} has 16 to "
+            f"{full.width} columns and 16 to {full.height} rows"
+        )
+    if chosen.depth_of_focus_um <= 0 or chosen.brightness <= 0:
+        raise ConfigError("sim.depth_of_focus_um and sim.brightness must be more than 0; use sim.cap for darkness")
+    return geometry
+
+
+def _place(chosen: SimSettings) -> tuple[float, float]:
+    """Return true focus and where the lens begins, a whole step, in um of travel."""
+    low = max(ROOM_UM, -chosen.start_um)
+    high = min(chosen.travel_um - ROOM_UM, chosen.travel_um - chosen.start_um)
+    if low > high:
+        raise ConfigError(
+            f"sim.start_um is {chosen.start_um:g}, too far for a travel of {chosen.travel_um:g} um with {ROOM_UM:g} um "
+            "of room at the ends; start nearer, or raise sim.travel_um"
+        )
+    drawn_um = float(random_stream(chosen.seed, "focus").uniform(low, high))
+    steps = (drawn_um + chosen.start_um) / chosen.um_per_step
+    last = int(chosen.travel_um / chosen.um_per_step)
+    start_um = min(max(round(steps), 0), last) * chosen.um_per_step
+    return start_um - chosen.start_um, start_um
+
+
+def _mechanics(chosen: SimSettings) -> LensMechanics:
+    return LensMechanics(
+        um_per_step=chosen.um_per_step,
+        travel_um=chosen.travel_um,
+        backlash_um=chosen.backlash_um,
+        microstep_error_um=chosen.microstep_error_um,
+    )
+
+
+def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[Lens, MemoryPort]:
+    speed_um_s, acceleration_um_s2 = 3 * chosen.speed_um_s, chosen.acceleration_um_s2
+    born_ns = world.now_ns()
+    if chosen.board == "grbl":
+        setup = GrblConfig(speed_um_s=speed_um_s, acceleration_um_s2=acceleration_um_s2, referenced=True)
+        port = MemoryPort(GrblBoard(mechanism, setup, seed=chosen.seed, begin_ns=born_ns), world)
+        world.add(port)
+        return grbl.open_lens({"um_per_step": chosen.um_per_step, "trust_position": True}, world, port), port
+    if chosen.board != "tic":
+        raise ConfigError(f"sim.board is {chosen.board!r}; known: {', '.join(BOARDS)}")
+    port = MemoryPort(TicBoard(mechanism, TicConfig(referenced=True), seed=chosen.seed, begin_ns=born_ns), world)
+    world.add(port)
+    table = {
+        "um_per_step": chosen.um_per_step,
+        "max_um": chosen.travel_um,
+        "max_speed_um_s": speed_um_s,
+        "acceleration_um_s2": acceleration_um_s2,
+    }
+    return tic.open_lens(table, world, port), port
+
+
+def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
+    return SimulatedAperture(
+        world,
+        random_stream(chosen.seed, "aperture"),
+        opening_ms=chosen.aperture_ms,
+        profile=chosen.aperture_profile,
+        fault="stuck" if chosen.aperture_stuck else "slow" if chosen.aperture_slow else None,
+    )
+
+
+def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geometry) -> SimulatedCamera:
+    seed, width, height = chosen.seed, geometry.width, geometry.height
+    sensor = EventSensor(
+        width,
+        height,
+        random_stream(seed, "pattern"),
+        random_stream(seed, "noise"),
+        noise_hz=chosen.noise_hz / chosen.brightness,
+        leak_hz=chosen.leak_hz,
+        hot_pixels=chosen.hot_pixels,
+        focus=BiasLevels(chosen.contrast_on, chosen.contrast_off, chosen.refractory_us),
+    )
+    davis = chosen.camera == "davis346"
+    frames = ApsFrames(width, height, random_stream(seed, "frames")) if davis else None
+    wire: Wire = ArrayWire() if davis else Evt3Wire(width)
+    born_ns = world.now_ns()
+    return SimulatedCamera(
+        world,
+        Retina(sensor, light, born_ns, frames),
+        wire,
+        geometry,
+        birth_ns=born_ns,
+        origin_us=int(random_stream(seed, "clock").integers(1_000_000, 20_000_000)),
+        jitter=random_stream(seed, "usb"),
+        frames=frames,
+        mask_slots=MASK_SLOTS[chosen.camera],
+        ring_packets=chosen.ring_packets,
+        faults=CameraFaults(
+            chosen.camera_vanishes_at_s, chosen.camera_silent_from_s, chosen.drop_from_s, chosen.drop_for_s
+        ),
+    )

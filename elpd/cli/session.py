@@ -1,0 +1,65 @@
+"""One cycle from the command line: build the rig, record the run, focus, tell the truth where a simulator knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from elpd import rig
+from elpd.focus.cycle import FocusCycle, Observer, result_fields
+from elpd.focus.settings import CycleSettings, FocusRequest
+from elpd.record.journal import RunWriter
+from elpd.records import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from elpd.config import Config
+    from elpd.records import FocusResult, TemporalImage
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What a cycle left behind."""
+
+    result: FocusResult
+    truth: dict[str, float | None] | None
+    run: Path | None
+    map: TemporalImage | None
+
+    @property
+    def focused(self) -> bool:
+        """Whether the lens rests in focus."""
+        return self.result.outcome is Outcome.FOCUSED
+
+    def fields(self) -> dict[str, Any]:
+        """Return the JSON of `elpd focus`."""
+        fields = result_fields(self.result)
+        if self.truth is not None:
+            fields["truth"] = self.truth
+        fields["run"] = None if self.run is None else str(self.run)
+        return fields
+
+
+def focus_once(
+    config: Config,
+    request: FocusRequest,
+    observer: Observer | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Session:
+    """Run one whole cycle on the rig that *config* describes, and give the rig back.
+
+    Raises ``UsageError`` before anything moves, ``DeviceError`` after the lens has been told to stop.
+    """
+    parts = rig.build(config)
+    try:
+        with RunWriter.begin(config, request, parts) as run:
+            settings = CycleSettings.from_config(config)
+            cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))
+            result = cycle.run()
+            truth = None if parts.truth is None else parts.truth.errors(result)
+            run.finish(result_fields(result), truth=truth)
+        return Session(result, truth, run.path, cycle.map)
+    finally:
+        rig.release(parts)

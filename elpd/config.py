@@ -1,0 +1,193 @@
+"""Configuration: TOML on disk, typed in memory, a wrong key refused with its place.
+
+Components do not keep a ``Config``; whoever builds them (``elpd.rig``) passes the few numbers each needs. Device
+sections are open tables on purpose: their keys belong to the driver, which checks them itself.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from elpd.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Section(BaseModel):
+    """A table whose every key is known."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DeviceSection(BaseModel):
+    """A table for a driver: ``driver`` names the entry point, the other keys are the driver's own."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    driver: str = "sim"
+
+    def settings(self) -> dict[str, Any]:
+        """Return the driver's own keys."""
+        return dict(self.model_extra or {})
+
+
+class LensSection(DeviceSection):
+    """The lens and how to move it. Lengths on the motor's ruler."""
+
+    um_per_step: Positive = 0.3125
+    speed_um_s: Positive = 4000.0
+    backlash_um: Annotated[float, Field(ge=0)] = 6.0
+    """Upper bound of the play between motor and carriage: the final approach overshoots by this much and a margin."""
+    first_direction: Literal["auto", "up", "down"] = "auto"
+    """Which way to probe first; ``auto`` is towards the longer way to a limit."""
+
+
+class FocusSection(_Section):
+    """One focus cycle."""
+
+    roi: tuple[int, int, int, int] | None = None
+    roi_fraction: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Side of a proposed ROI as a fraction of the sensor's shorter side."""
+    depth_of_focus_um: Positive = 6.0
+    deadline_ms: Positive = 5000.0
+    max_travel_um: Positive = 1500.0
+    """Longest way in one direction before focus counts as not found."""
+    max_reversals: Annotated[int, Field(ge=0, le=5)] = 2
+    max_sigma_dof: Positive = 0.5
+    """LOW_CONFIDENCE above this many depths of focus of standard error."""
+    on_failure: Literal["hold", "start", "preset"] = "start"
+    preset_um: float | None = None
+    method: Literal["elpd", "paper"] = "elpd"
+    transmittance: Literal["profile", "linear", "iris"] = "profile"
+    """``profile`` asks the aperture for its own."""
+
+
+class JournalSection(_Section):
+    """Where runs are written."""
+
+    directory: Path = Path("runs")
+    enabled: bool = True
+    keep: Annotated[int, Field(ge=1)] = 50
+    memory_mb: Positive = 256.0
+    """How much may wait in memory while the lens moves; past it the run's journal ends, marked truncated."""
+
+
+class SimSection(_Section):
+    """The simulated rig. Everything is drawn from ``seed``; a set key wins over the draw."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    start_um: float = -200.0
+    scene: str = "random"
+    motion: Literal["static", "moderate", "violent", "shake"] = "static"
+    board: str = "tic"
+    camera: Literal["evk4", "davis346"] = "evk4"
+    depth_of_focus_um: Positive = 6.0
+    speed_um_s: Positive = 4000.0
+    pace: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Config(_Section):
+    """Everything."""
+
+    rig: Literal["sim", "hardware"] = "sim"
+    camera: DeviceSection = DeviceSection()
+    lens: LensSection = LensSection()
+    aperture: DeviceSection = DeviceSection()
+    focus: FocusSection = FocusSection()
+    journal: JournalSection = JournalSection()
+    sim: SimSection = SimSection()
+
+
+def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """Read a configuration.
+
+    Parameters
+    ----------
+    path
+        A TOML file, or ``None`` for the defaults (the simulated rig).
+    overrides
+        ``KEY=VALUE`` strings with dotted keys, applied after the file. Values are TOML where they parse as TOML,
+        else bare strings.
+
+    Raises
+    ------
+    ConfigError
+        With the file and line, or the override, that is wrong.
+
+    """
+    text = _read(path) if path is not None else ""
+    try:
+        table: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: {error}; see config/elpd.toml for an annotated example") from None
+    for override in overrides:
+        _apply(table, override)
+    try:
+        return Config.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, path, text, overrides)) from None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give --config another file") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not text; a configuration is a TOML file in UTF-8") from None
+
+
+def _apply(table: dict[str, Any], override: str) -> None:
+    key, separator, value = override.partition("=")
+    names = key.strip().split(".")
+    if not separator or not all(names):
+        raise ConfigError(f"--set takes KEY=VALUE with a dotted key, such as sim.seed=3; got {override!r}")
+    target = table
+    for name in names[:-1]:
+        target = target.setdefault(name, {})
+        if not isinstance(target, dict):
+            raise ConfigError(f"--set {override}: {name!r} is a value, not a table")
+    try:
+        target[names[-1]] = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        target[names[-1]] = value
+
+
+def _explain(error: ValidationError, path: Path | None, text: str, overrides: Sequence[str]) -> str:
+    """Say the first thing that is wrong, and where."""
+    first = error.errors()[0]
+    names = [str(part) for part in first["loc"]]
+    key = ".".join(names)
+    what = "unknown key" if first["type"] == "extra_forbidden" else first["msg"].lower()
+    if any(item.partition("=")[0].strip() == key for item in overrides):
+        where = f"--set {key}"
+    else:
+        where = f"{path}:{_line_of(text, names)}: {key}"
+    known = ""
+    if first["type"] == "extra_forbidden":
+        section: BaseModel = Config() if len(names) == 1 else getattr(Config(), names[0], Config())
+        known = f"; known here: {', '.join(sorted(type(section).model_fields))}"
+    return f"{where}: {what} (got {first['input']!r}){known}"
+
+
+def _line_of(text: str, names: list[str]) -> int:
+    """Find the line that holds a key, for the message; 1 where it cannot be told."""
+    section = ""
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped = line.strip()
+        if stripped.startswith("["):
+            section = stripped.strip("[] ")
+        if stripped.split("=")[0].strip() == names[-1] and section == ".".join(names[:-1]):
+            return number
+        if section == ".".join(names):
+            return number
+    return 1

@@ -1,0 +1,152 @@
+"""What every phase of a cycle stands on: one way to wait, one way to rest, one set of counters.
+
+Waiting is reading: while a lens moves or settles the camera goes on delivering, and whoever sleeps instead loses events
+in its ring. So every wait of a cycle is ``Stage.read`` until a deadline, and the lens is polled each time round.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from elpd.errors import CameraError, LensError
+from elpd.ports import Latency
+from elpd.timebase import SensorClock
+from elpd.units import NS_PER_MS, NS_PER_US, HostNs, SensorUs, Steps, after_ms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from elpd.ports import RigParts
+    from elpd.records import CameraPacket, Frame, LensReport
+
+READ_TIMEOUT_S = 0.002
+"""One turn of a wait; the lens is polled at least this often."""
+
+SILENCE_MS = 200.0
+"""Outside a sweep a camera may take this long to speak (bias changes, windows) before it counts as lost."""
+
+
+class Stage:
+    """The rig during one cycle, with the sensor's clock, the newest frame and the counters."""
+
+    def __init__(self, parts: RigParts) -> None:
+        self.parts = parts
+        self.um_per_step = parts.um_per_step
+        latency_us = parts.camera.min_latency_us if isinstance(parts.camera, Latency) else 0.0
+        self.sensor_clock = SensorClock(latency_us)
+        self.frame: Frame | None = None
+        self.report: LensReport | None = None
+        self.packets = 0
+        self.lost_events = 0
+        self.gaps = 0
+        self.last_packet_ns = parts.clock.now_ns()
+        self.listener: Callable[[CameraPacket], object] | None = None
+        """Hears every packet that is read while a phase waits."""
+
+    # --- time and place ---
+
+    def now_ns(self) -> HostNs:
+        """Return the host's time."""
+        return self.parts.clock.now_ns()
+
+    def to_um(self, steps: float) -> float:
+        """Convert steps to um on the motor's ruler."""
+        return steps * self.um_per_step
+
+    def to_steps(self, um: float) -> Steps:
+        """Convert um on the motor's ruler to the nearest step."""
+        return Steps(round(um / self.um_per_step))
+
+    def position_um(self, when: SensorUs) -> float:
+        """Return where the motor was at a sensor time."""
+        return self.to_um(self.parts.lens.position_at(self.sensor_clock.to_host(when)).steps)
+
+    # --- waiting ---
+
+    def read(self, timeout_s: float = READ_TIMEOUT_S) -> CameraPacket | None:
+        """Read one packet, poll the lens once, keep the counters.
+
+        Raises ``CameraError`` after 200 ms of silence, ``LensError`` from the lens.
+        """
+        packet = self.parts.camera.read(timeout_s)
+        report = self.parts.lens.poll()
+        if report is not None:
+            self.report = report
+        if packet is None:
+            silent_ms = (self.now_ns() - self.last_packet_ns) / NS_PER_MS
+            if silent_ms > SILENCE_MS:
+                raise CameraError(
+                    f"camera: no data for {silent_ms:.0f} ms (limit {SILENCE_MS:.0f}); check its cable and power"
+                )
+            return None
+        self.packets += 1
+        self.last_packet_ns = packet.received_ns
+        self.lost_events += packet.lost_events
+        self.gaps += packet.gap_before
+        if packet.complete_until_us is not None:
+            self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
+        if packet.frames:
+            self.frame = packet.frames[-1]
+        if self.listener is not None:
+            self.listener(packet)
+        return packet
+
+    def rest(self, limit_ms: float) -> LensReport:
+        """Wait until two reports in a row show the same place and no motion; return the last.
+
+        Raises ``LensError`` if the lens is still moving after *limit_ms*.
+        """
+        deadline = after_ms(self.now_ns(), limit_ms)
+        asked_ns = self.now_ns()
+        before: LensReport | None = None
+        while self.now_ns() < deadline:
+            self.read()
+            report = self.report
+            if report is None or report is before or report.earliest_ns < asked_ns:
+                continue
+            if before is not None and not report.moving and report.steps == before.steps:
+                return report
+            before = report
+        where = "nowhere" if self.report is None else f"{self.to_um(self.report.steps):.1f} um"
+        raise LensError(
+            f"lens: not at rest within {limit_ms:.0f} ms (last report: {where}); "
+            "check that it obeys STOP and that nothing else drives it"
+        )
+
+    def wait_ms(self, ms: float) -> None:
+        """Let time pass, reading on."""
+        until = after_ms(self.now_ns(), ms)
+        while self.now_ns() < until:
+            self.read(min(READ_TIMEOUT_S, (until - self.now_ns()) / 1e9))
+
+    def move(self, target_um: float, speed_um_s: float, acceleration_sps2: float) -> LensReport:
+        """Go to a place and wait until at rest there. The wait is bounded by the way and the speed."""
+        steps = self.to_steps(target_um)
+        speed_sps = speed_um_s / self.um_per_step
+        start = self.parts.lens.position_at(self.now_ns()).steps
+        self.parts.lens.move_to(steps, speed_sps)
+        way_s = abs(steps - start) / speed_sps + 2 * speed_sps / max(acceleration_sps2, 1.0)
+        return self.rest(300.0 + 3000.0 * way_s)
+
+    def newest_frame(self, limit_ms: float) -> Frame | None:
+        """Wait for a frame that was exposed after now; ``None`` if none came."""
+        begun_us = None
+        until = after_ms(self.now_ns(), limit_ms)
+        while self.now_ns() < until:
+            packet = self.read()
+            if packet is None:
+                continue
+            if begun_us is None and self.sensor_clock.known:
+                begun_us = self.sensor_clock.to_sensor(self.now_ns())
+            for frame in packet.frames:
+                if begun_us is not None and frame.t_us - frame.exposure_us // 2 >= begun_us:
+                    return frame
+        return None
+
+    def elapsed_ms(self, since: HostNs) -> float:
+        """Return the milliseconds since an instant."""
+        return (self.now_ns() - since) / NS_PER_MS
+
+    def age_us(self, when: SensorUs) -> int:
+        """Return how long ago a sensor time was, in us."""
+        return (self.now_ns() - self.sensor_clock.to_host(when)) // NS_PER_US

@@ -1,0 +1,259 @@
+"""A rig whose every device asks one channel: the same doubles record and replay.
+
+A run is recorded at the seams. Each device is replaced by a double that turns a method call into
+``channel.ask("camera.read", timeout_s)``. While recording, the channel passes the question on to the true device and
+keeps the answer; while replaying, it answers from the tape. So whatever the cycle can notice of a double (its methods,
+its optional abilities) is the same both times by construction.
+
+Properties are read once, when the rig is taped, and are constants from then on, for the same reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
+
+from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask, RigParts
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from elpd.ports import Aperture, Clock, EventCamera, Lens
+    from elpd.records import (
+        BiasSet,
+        CameraPacket,
+        CommandStamp,
+        Geometry,
+        LensCapabilities,
+        LensLimits,
+        LensReport,
+        PositionEstimate,
+        Roi,
+        StopMode,
+    )
+    from elpd.units import HostNs, Steps
+
+
+class Channel(Protocol):
+    """What a double asks instead of a device."""
+
+    def ask(self, call: str, /, *arguments: Any) -> Any:
+        """Return the answer to *call* (``device.method``), or raise what the device raised."""
+        ...
+
+    def ask_array(self, call: str, argument: NDArray[np.float64], /) -> NDArray[np.float64]:
+        """As ``ask``, for the one call that takes and returns an array."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RigFacts:
+    """What is constant about a rig: its properties and which optional abilities each device has."""
+
+    geometry: Geometry
+    limits: LensLimits
+    capabilities: LensCapabilities
+    um_per_step: float
+    opening_ms: float | None
+    min_latency_us: float | None
+    abilities: dict[str, tuple[str, ...]]
+
+    @classmethod
+    def of(cls, parts: RigParts) -> RigFacts:
+        """Read every property of *parts* once. ``opening_ms`` is ``None`` where there is no aperture."""
+        camera = parts.camera
+        return cls(
+            geometry=camera.geometry,
+            limits=parts.lens.limits,
+            capabilities=parts.lens.capabilities,
+            um_per_step=parts.um_per_step,
+            opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
+            min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
+            abilities={
+                "clock": _abilities(parts.clock, ("Closeable",)),
+                "camera": _abilities(camera, tuple(_PROTOCOLS)),
+                "lens": _abilities(parts.lens, ("Closeable",)),
+            },
+        )
+
+
+def build_doubles(facts: RigFacts, channel: Channel) -> RigParts:
+    """Return a rig that asks *channel* for everything that is not constant. It knows no truth."""
+
+    def make(device: str, base: type) -> Any:
+        mixins = tuple(_MIXINS[name] for name in facts.abilities.get(device, ()))
+        return type(base.__name__, (base, *mixins), {})(facts, channel)
+
+    return RigParts(
+        clock=cast("Clock", make("clock", _ClockDouble)),
+        camera=cast("EventCamera", make("camera", _CameraDouble)),
+        lens=cast("Lens", make("lens", _LensDouble)),
+        aperture=None if facts.opening_ms is None else cast("Aperture", make("aperture", _ApertureDouble)),
+        um_per_step=facts.um_per_step,
+    )
+
+
+def methods_of(parts: RigParts) -> dict[str, Callable[..., Any]]:
+    """Return the bound method behind every call that a double of *parts* can make."""
+    clock, camera, lens, aperture = parts.clock, parts.camera, parts.lens, parts.aperture
+    methods: dict[str, Callable[..., Any]] = {
+        "clock.now_ns": clock.now_ns,
+        "clock.sleep_until": clock.sleep_until,
+        "camera.start": camera.start,
+        "camera.read": camera.read,
+        "camera.stop": camera.stop,
+        "lens.home": lens.home,
+        "lens.move_to": lens.move_to,
+        "lens.run": lens.run,
+        "lens.stop": lens.stop,
+        "lens.poll": lens.poll,
+        "lens.position_at": lens.position_at,
+    }
+    if aperture is not None:
+        methods |= {
+            "aperture.open": aperture.open,
+            "aperture.close": aperture.close,
+            "aperture.transmittance": aperture.transmittance,
+        }
+    if isinstance(camera, HardwareRoi):
+        methods["camera.set_window"] = camera.set_window
+    if isinstance(camera, Biases):
+        methods["camera.apply_biases"] = camera.apply_biases
+    if isinstance(camera, PixelMask):
+        methods["camera.set_mask"] = camera.set_mask
+    for name, device in (("clock", clock), ("camera", camera), ("lens", lens)):
+        if isinstance(device, Closeable):
+            methods[f"{name}.close"] = device.close
+    return methods
+
+
+class _Double:
+    device: ClassVar[str]
+
+    def __init__(self, facts: RigFacts, channel: Channel) -> None:
+        self._facts = facts
+        self._ask = channel.ask
+        self._ask_array = channel.ask_array
+
+
+class _ClockDouble(_Double):
+    device = "clock"
+
+    def now_ns(self) -> HostNs:
+        return cast("HostNs", self._ask("clock.now_ns"))
+
+    def sleep_until(self, when: HostNs) -> None:
+        self._ask("clock.sleep_until", when)
+
+
+class _CameraDouble(_Double):
+    device = "camera"
+
+    @property
+    def geometry(self) -> Geometry:
+        return self._facts.geometry
+
+    def start(self) -> None:
+        self._ask("camera.start")
+
+    def read(self, timeout_s: float) -> CameraPacket | None:
+        return cast("CameraPacket | None", self._ask("camera.read", timeout_s))
+
+    def stop(self) -> None:
+        self._ask("camera.stop")
+
+
+class _LensDouble(_Double):
+    device = "lens"
+
+    @property
+    def limits(self) -> LensLimits:
+        return self._facts.limits
+
+    @property
+    def capabilities(self) -> LensCapabilities:
+        return self._facts.capabilities
+
+    def home(self, deadline: HostNs) -> LensReport:
+        return cast("LensReport", self._ask("lens.home", deadline))
+
+    def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
+        return cast("CommandStamp", self._ask("lens.move_to", target, speed_sps))
+
+    def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
+        return cast("CommandStamp", self._ask("lens.run", velocity_sps, until))
+
+    def stop(self, mode: StopMode) -> CommandStamp:
+        return cast("CommandStamp", self._ask("lens.stop", mode))
+
+    def poll(self) -> LensReport | None:
+        return cast("LensReport | None", self._ask("lens.poll"))
+
+    def position_at(self, when: HostNs) -> PositionEstimate:
+        return cast("PositionEstimate", self._ask("lens.position_at", when))
+
+
+class _ApertureDouble(_Double):
+    device = "aperture"
+
+    def open(self) -> CommandStamp:
+        return cast("CommandStamp", self._ask("aperture.open"))
+
+    def close(self) -> CommandStamp:
+        return cast("CommandStamp", self._ask("aperture.close"))
+
+    @property
+    def opening_ms(self) -> float:
+        return cast("float", self._facts.opening_ms)
+
+    def transmittance(self, since_open_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._ask_array("aperture.transmittance", since_open_us)
+
+
+class _WithHardwareRoi(_Double):
+    def set_window(self, window: Roi | None) -> None:
+        self._ask("camera.set_window", window)
+
+
+class _WithBiases(_Double):
+    def apply_biases(self, biases: BiasSet) -> None:
+        self._ask("camera.apply_biases", biases)
+
+
+class _WithPixelMask(_Double):
+    def set_mask(self, pixels: Sequence[tuple[int, int]]) -> int:
+        return cast("int", self._ask("camera.set_mask", tuple(pixels)))
+
+
+class _WithLatency(_Double):
+    @property
+    def min_latency_us(self) -> float:
+        return cast("float", self._facts.min_latency_us)
+
+
+class _WithClose(_Double):
+    def close(self) -> None:
+        self._ask(f"{self.device}.close")
+
+
+_PROTOCOLS: dict[str, Any] = {
+    "HardwareRoi": HardwareRoi,
+    "Biases": Biases,
+    "PixelMask": PixelMask,
+    "Latency": Latency,
+    "Closeable": Closeable,
+}
+_MIXINS: dict[str, type] = {
+    "HardwareRoi": _WithHardwareRoi,
+    "Biases": _WithBiases,
+    "PixelMask": _WithPixelMask,
+    "Latency": _WithLatency,
+    "Closeable": _WithClose,
+}
+
+
+def _abilities(device: object, candidates: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(name for name in candidates if isinstance(device, _PROTOCOLS[name]))

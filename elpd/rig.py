@@ -1,0 +1,118 @@
+"""Wiring, by hand and in one place: configuration in, devices out.
+
+Drivers are found through entry points, so a stranger's package uses the same door as ours. A simulated rig comes as a
+whole (its parts share a world); any of its parts can be replaced by a driver of its own, which then lives on the same
+clock: a recording as the camera (``camera.driver = "file"``), a lens over a real port.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any
+
+from elpd.errors import ConfigError, DeviceError
+from elpd.ports import Closeable, RigParts
+from elpd.timebase import MonotonicClock
+
+if TYPE_CHECKING:
+    from elpd.config import Config, DeviceSection, LensSection
+    from elpd.ports import Aperture, Clock, EventCamera, Lens
+
+GROUPS = ("elpd.rigs", "elpd.cameras", "elpd.lenses", "elpd.apertures", "elpd.formats", "elpd.boards")
+
+
+def find(group: str, name: str) -> Any:
+    """Load one entry point.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such driver; the message lists those there are.
+    DeviceError
+        If it is there and cannot be imported.
+
+    """
+    found = {point.name: point for point in entry_points(group=group)}
+    if name not in found:
+        kind = group.removeprefix("elpd.").rstrip("s")
+        known = ", ".join(sorted(found)) or "none"
+        raise ConfigError(f"no {kind} driver is called {name!r}; installed: {known}")
+    return _load(found[name])
+
+
+def build(config: Config) -> RigParts:
+    """Build the rig that *config* describes. Nothing moves yet.
+
+    Raises ``ConfigError`` for unknown drivers and keys, ``DeviceError`` for devices that do not answer.
+    """
+    if config.rig == "sim":
+        parts: RigParts = find("elpd.rigs", "sim")(
+            {
+                **config.sim.model_dump(),
+                "um_per_step": config.lens.um_per_step,
+            }
+        )
+    else:
+        parts = _hardware(config)
+    return _with_replacements(parts, config) if config.rig == "sim" else parts
+
+
+def release(parts: RigParts) -> None:
+    """Give every device back, the lens last: it must be able to stop until the end."""
+    for device in (parts.camera, parts.aperture, parts.lens):
+        if isinstance(device, Closeable):
+            device.close()
+
+
+def _hardware(config: Config) -> RigParts:
+    for name in ("camera", "lens"):
+        if getattr(config, name).driver == "sim":
+            raise ConfigError(f'{name}.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    clock = MonotonicClock()
+    lens = _open_lens(config.lens, clock)
+    try:
+        camera = _open("elpd.cameras", config.camera, clock)
+        aperture = None if config.aperture.driver in {"sim", "none"} else _open_aperture(config.aperture, clock)
+    except BaseException:
+        if isinstance(lens, Closeable):
+            lens.close()
+        raise
+    return RigParts(clock, camera, lens, aperture, config.lens.um_per_step)
+
+
+def _with_replacements(parts: RigParts, config: Config) -> RigParts:
+    if config.camera.driver != "sim":
+        parts = replace(parts, camera=_open("elpd.cameras", config.camera, parts.clock), truth=None)
+    if config.lens.driver != "sim":
+        parts = replace(parts, lens=_open_lens(config.lens, parts.clock), truth=None)
+    if config.aperture.driver == "none":
+        parts = replace(parts, aperture=None)
+    elif config.aperture.driver != "sim":
+        parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock))
+    return parts
+
+
+def _open(group: str, section: DeviceSection, clock: Clock) -> EventCamera:
+    camera: EventCamera = find(group, section.driver)(section.settings(), clock)
+    return camera
+
+
+def _open_lens(section: LensSection, clock: Clock) -> Lens:
+    settings = {**section.settings(), "um_per_step": section.um_per_step, "max_speed_um_s": section.speed_um_s}
+    lens: Lens = find("elpd.lenses", section.driver)(settings, clock)
+    return lens
+
+
+def _open_aperture(section: DeviceSection, clock: Clock) -> Aperture:
+    aperture: Aperture = find("elpd.apertures", section.driver)(section.settings(), clock)
+    return aperture
+
+
+def _load(point: EntryPoint) -> Any:
+    try:
+        return point.load()
+    except ImportError as error:
+        raise DeviceError(
+            f"the driver {point.name!r} ({point.value}) cannot be imported: {error}; install what it needs"
+        ) from error

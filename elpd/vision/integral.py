@@ -1,0 +1,212 @@
+"""The band energy S of the image that the events themselves keep up to date, and the vertex of its logarithm.
+
+``dS/dt`` of ``S = Σ A·|B·L|²`` (B a band-pass, L the log image) *is* the Event Laplacian Product with a reference that
+is always current. S depends on the amplitude spectrum alone, so scene motion leaves it unchanged, and a Gaussian blur
+makes ``log S`` a parabola in the lens position whose vertex is focus (``facts/motion.md``). No registration, no sharp
+picture, no contrast threshold: L is counted in thresholds, from zero at the start of the sweep. What the start picture
+looked like does not matter, because ``|h(z) - h(z_start)|²`` is as symmetric in defocus as ``|h(z)|²``.
+
+Events say where a level was crossed, not where the intensity is: a pixel that has turned stays silent until it has
+fallen by what it had risen beyond its last event, plus one threshold. So the image at a decision is *rebuilt*: levels
+are joined linearly, and at a turn the mirror of the last rise is inserted (the idea of ``pairs``, per pixel). Threshold
+mismatch between pixels adds a pattern that grows with the square of the event counts; its expectation is subtracted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from elpd.events.jit import kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BANDS_PX = (0.8, 1.2)
+"""Inner standard deviations of the difference-of-Gaussian bands; the outer is 1.6 times larger."""
+
+MISMATCH = 0.15
+"""Standard deviation of the contrast threshold over pixels, relative; 0.1 to 0.2 in all sensors that publish it."""
+
+_BAND_RATIO = 1.6
+
+
+def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
+    """Return the weighted mean square of one band of *image*, leaving *margin* pixels at each side out of the mean."""
+    inner = cv2.GaussianBlur(image, (0, 0), scale_px)
+    inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
+    inside = slice(margin, -margin or None)
+    square = np.square(inner[inside, inside])
+    square *= weight[inside, inside]
+    return float(square.mean(dtype=np.float64))
+
+
+def band_gain(scale_px: float) -> float:
+    """Return the variance that white noise of unit variance has in a band: the sum of the kernel's squares."""
+    impulse = np.zeros((33, 33), dtype=np.float32)
+    impulse[16, 16] = 1.0
+    return band_energy(impulse, scale_px, np.ones_like(impulse)) * impulse.size
+
+
+@kernel("void(uint16[::1], uint16[::1], uint8[::1], int32[:, ::1])")
+def add_events(
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    level: NDArray[np.int32],
+) -> None:
+    """Add ±1 per event to *level*, (height, width), in place."""
+    for i in range(x.size):
+        level[y[i], x[i]] += 2 * np.int32(on[i]) - 1
+
+
+@kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
+def rebuild_levels(
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    position: NDArray[np.float64],
+    on: NDArray[np.uint8],
+    ticks: NDArray[np.float64],
+    level: NDArray[np.float32],
+    squares: NDArray[np.float64],
+) -> None:
+    """Rebuild each pixel's level at each tick from its events, without the hysteresis of the sensor.
+
+    Parameters
+    ----------
+    starts, order:
+        Events of pixel ``k`` in time order are ``order[starts[k] : starts[k + 1]]``.
+    position, on:
+        Lens position (rising with time) and polarity of each event.
+    ticks:
+        Positions at which the levels are wanted, rising.
+    level:
+        Output, (ticks, pixels): level in thresholds, zero at the beginning.
+    squares:
+        Output, (ticks, 2): sum over pixels of n_on² and of n_off² up to each tick; added to.
+    """
+    n_ticks = ticks.size
+    for k in range(starts.size - 1):
+        begin = starts[k]
+        end = starts[k + 1]
+        tick = 0
+        value = 0.0
+        at = -1e300  # where the last knot lies; before the first event the level is constant
+        n_on = 0
+        n_off = 0
+        for j in range(begin, end):
+            i = order[j]
+            here = position[i]
+            step = 1.0 if on[i] else -1.0
+            if j == begin:
+                while tick < n_ticks and ticks[tick] < here:
+                    level[tick, k] = value
+                    tick += 1
+            else:
+                previous = order[j - 1]
+                last = position[previous]
+                if on[previous] != on[i]:
+                    # The turn: the level of the last event is met again on the way back.
+                    mirrored = 0.5 * (last + here)
+                    if j - 2 >= begin:
+                        earlier = order[j - 2]
+                        if on[earlier] == on[previous]:
+                            mirrored = max(here - (last - position[earlier]), mirrored)
+                    at = mirrored
+                else:
+                    at = last
+                while tick < n_ticks and ticks[tick] < at:
+                    level[tick, k] = value
+                    squares[tick, 0] += n_on * n_on
+                    squares[tick, 1] += n_off * n_off
+                    tick += 1
+                width = here - at
+                while tick < n_ticks and ticks[tick] < here:
+                    part = (ticks[tick] - at) / width if width > 0.0 else 1.0
+                    level[tick, k] = value + step * part
+                    squares[tick, 0] += n_on * n_on
+                    squares[tick, 1] += n_off * n_off
+                    tick += 1
+            value += step
+            if on[i]:
+                n_on += 1
+            else:
+                n_off += 1
+        while tick < n_ticks:
+            level[tick, k] = value
+            squares[tick, 0] += n_on * n_on
+            squares[tick, 1] += n_off * n_off
+            tick += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Vertex:
+    """Where ``log S`` peaks, one standard error from the scatter about the parabola, and the curve's own width.
+
+    ``width`` is the standard deviation of the Gaussian that S follows near its peak, in the unit of the positions;
+    it is the natural ruler of an optical system whose depth of focus nobody has told.
+    """
+
+    at: float
+    sigma: float
+    width: float
+    points: int
+
+
+def group_by_pixel(pixel: NDArray[np.int64], pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return (starts, order): a stable sort of event indices by pixel."""
+    order = np.argsort(pixel, kind="stable").astype(np.int64)
+    starts = np.zeros(pixels + 1, dtype=np.int64)
+    np.cumsum(np.bincount(pixel, minlength=pixels), out=starts[1:])
+    return starts, order
+
+
+def fit_vertex(position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float) -> Vertex | None:
+    """Fit a parabola over a window that is kept symmetric about its own vertex; ``None`` if there is no peak inside.
+
+    The window is what the data past the vertex allow, at most *half_width*. A window that is not symmetric would turn
+    every departure from a parabola into bias.
+    """
+    if position.size < 3:
+        return None
+    at = float(position[int(np.argmax(log_energy))])
+    result = None
+    for _ in range(8):
+        reach = min(half_width, float(position[-1]) - at, at - float(position[0]))
+        inside = np.abs(position - at) <= reach * (1.0 + 1e-9)
+        if int(inside.sum()) < 3:
+            nearest = np.sort(np.argsort(np.abs(position - at), kind="stable")[:3])
+            inside = np.zeros(position.size, dtype=bool)
+            inside[nearest] = True
+        result = _parabola(position[inside], log_energy[inside])
+        if result is None or not position[inside][0] <= result.at <= position[inside][-1]:
+            return None
+        if abs(result.at - at) < 1e-3 * max(reach, 1e-12):
+            break
+        at = result.at
+    return result
+
+
+def _parabola(position: NDArray[np.float64], log_energy: NDArray[np.float64]) -> Vertex | None:
+    middle = float(position.mean())
+    scale = float(np.ptp(position)) / 2.0
+    if scale <= 0.0:
+        return None
+    z = (position - middle) / scale
+    design = np.stack([np.ones_like(z), z, z * z], axis=1)
+    coefficients, *_ = np.linalg.lstsq(design, log_energy, rcond=None)
+    _, slope, curvature = (float(one) for one in coefficients)
+    if curvature >= 0.0:
+        return None
+    at = -slope / (2.0 * curvature)
+    residual = log_energy - design @ coefficients
+    freedom = position.size - 3
+    variance = float(residual @ residual) / freedom if freedom > 0 else 0.0
+    covariance = np.linalg.pinv(design.T @ design) * variance
+    gradient = np.array([0.0, -1.0 / (2.0 * curvature), slope / (2.0 * curvature**2)])
+    sigma = float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+    width = float(np.sqrt(-1.0 / (2.0 * curvature)))
+    return Vertex(middle + scale * at, scale * sigma, scale * width, int(position.size))

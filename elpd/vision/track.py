@@ -1,0 +1,162 @@
+"""A curve of log sharpness along the sweep, and the two questions that are asked of it while it grows.
+
+Has it passed a peak: did it rise and then fall by more than its own scatter? And where was the peak? The same curve is
+drawn from frames (the sharpest witness where there are any) and from the image that events keep up to date.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from elpd.vision.integral import BANDS_PX, Vertex, add_events, band_energy, fit_vertex
+from elpd.vision.reference import full_scale
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from elpd.records import Roi
+
+DROP = 0.10
+"""Fall of log S that makes a peak a peak: the blur of 0.45 widths of the curve, under three depths of focus."""
+
+RISE = 0.10
+"""Rise of log S before it: a sweep that begins in focus has no peak inside."""
+
+FIT_DROP = 0.25
+"""How far down the curve's sides a parabola is believed."""
+
+_FRAME_GROUND = 10.0 / 255.0
+_FLOOR = 1e-12
+
+
+class PeakTrack:
+    """A growing curve of (position, log S)."""
+
+    def __init__(self) -> None:
+        self.times_us: list[int] = []
+        self.positions: list[float] = []
+        self.values: list[float] = []
+        self._peak = 0
+        self._lowest_before_peak = float("inf")
+        self._lowest = float("inf")
+
+    def add(self, t_us: int, position: float, value: float) -> None:
+        """Append a point; times rise."""
+        if not self.values or value > self.values[self._peak]:
+            self._peak = len(self.values)
+            self._lowest_before_peak = self._lowest
+        self._lowest = min(self._lowest, value)
+        self.times_us.append(t_us)
+        self.positions.append(position)
+        self.values.append(value)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def peak(self) -> int:
+        """Index of the highest point so far."""
+        return self._peak
+
+    @property
+    def rise(self) -> float:
+        """How far the curve had risen, from its lowest point before the peak."""
+        return self.values[self._peak] - min(self._lowest_before_peak, self.values[self._peak]) if self.values else 0.0
+
+    @property
+    def drop(self) -> float:
+        """How far it has fallen since the peak."""
+        return self.values[self._peak] - self.values[-1] if self.values else 0.0
+
+    @property
+    def scatter(self) -> float:
+        """One standard deviation of the curve about a smooth one, at the scale of its own peak.
+
+        From second differences of up to 32 averages between the flank and now: neighbouring points share most of
+        their error, so their own differences would flatter them.
+        """
+        values = np.array(self.values[self.flank(1.0) :])
+        if values.size < 6:
+            return 0.0
+        means = np.array([part.mean() for part in np.array_split(values, min(32, values.size))])
+        second = np.diff(means, 2)
+        return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6.0))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the curve has risen to a peak and fallen from it, beyond scatter."""
+        needed = max(DROP, 6.0 * self.scatter)
+        return len(self) >= 3 and self.rise > max(RISE, needed) and self.drop > needed
+
+    def flank(self, depth: float) -> int:
+        """Return the index from which on, before the peak, the curve stays within *depth* of it."""
+        k = self._peak
+        while k > 0 and self.values[k - 1] > self.values[self._peak] - depth:
+            k -= 1
+        return k
+
+    def vertex(self) -> Vertex | None:
+        """Return the vertex of the parabola through what lies within ``FIT_DROP`` of the peak."""
+        if len(self) < 3:
+            return None
+        begin = self.flank(2.0 * FIT_DROP)
+        z = np.array(self.positions[begin:])
+        y = np.array(self.values[begin:])
+        if z[-1] < z[0]:
+            z = -z
+            vertex = self._fit(z, y)
+            return None if vertex is None else Vertex(-vertex.at, vertex.sigma, vertex.width, vertex.points)
+        return self._fit(z, y)
+
+    @staticmethod
+    def _fit(z: NDArray[np.float64], y: NDArray[np.float64]) -> Vertex | None:
+        wide = fit_vertex(z, y, float(np.ptp(z)))
+        if wide is None:
+            return None
+        return fit_vertex(z, y, wide.width * np.sqrt(2.0 * FIT_DROP)) or wide
+
+
+class FrameEnergy:
+    """``log S`` of whole frames over a region, weighted by the brightness of the first."""
+
+    def __init__(self, roi: Roi, margin: int) -> None:
+        self._roi = roi
+        self._margin = margin
+        self._weight: NDArray[np.float32] | None = None
+
+    def measure(self, pixels: NDArray[np.generic]) -> float:
+        """Return log S of a frame, 8 or 16 bit."""
+        roi, margin = self._roi, self._margin
+        top, left = max(0, roi.y - margin), max(0, roi.x - margin)
+        part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
+        scale = full_scale(pixels) or 1.0
+        image = part.astype(np.float32) / np.float32(scale)
+        if self._weight is None:
+            smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(1e-6)
+            self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
+        inside = np.zeros_like(image)
+        inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
+        energy = band_energy(np.log(image + np.float32(_FRAME_GROUND)), BANDS_PX[0], self._weight * inside)
+        return float(np.log(energy + _FLOOR))
+
+
+class EventEnergy:
+    """``log S`` of the image that events build, from nothing."""
+
+    def __init__(self, height: int, width: int, margin: int) -> None:
+        self.level = np.zeros((height, width), dtype=np.int32)
+        self._margin = margin
+        self._weight = np.ones((height, width), dtype=np.float32)
+
+    def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
+        """Take events, in coordinates of the image."""
+        add_events(x, y, on, self.level)
+
+    def measure(self) -> float:
+        """Return log S now."""
+        return float(
+            np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR)
+        )
