@@ -109,10 +109,11 @@ class TicLens:
             settings.max_speed_um_s,
             settings.acceleration_um_s2,
         )
+        self._ramp_to_rest = Motion(self._limits.acceleration_sps2, rounding_steps=0.3)
         self._byte_ns = 10 * NS_PER_S // settings.baud
         sigma_ns = round(settings.latency_sigma_us * NS_PER_US)
         self._latency_ns, self._sigma_ns = round(settings.latency_us * NS_PER_US), sigma_ns
-        self._trajectory = Trajectory(Timing(self._latency_ns, sigma_ns, sigma_ns, quantum_steps=1.0))
+        self._trajectory = Trajectory(Timing(self._latency_ns, sigma_ns, sigma_ns, quantum_steps=1.0, ramp_steps=0.3))
         self._lock = threading.Lock()
         self._line_free_ns = 0
         self._received = bytearray()
@@ -124,7 +125,7 @@ class TicLens:
         self._errors = 0
         self._referenced = False
         self._halted_softly = False
-        self._speed_word = -1
+        self._speed_sps = 0.0
         self._rest_due_ns: int | None = None
         self._stops = self._stops_ignored = 0
         self._implausible = 0
@@ -241,7 +242,7 @@ class TicLens:
         done = self._clock.now_ns()
         with self._lock:
             effective = self._on_wire(len(data), begun) + self._latency_ns
-            motion = REST if mode is StopMode.ABRUPT else Motion(self._limits.acceleration_sps2)
+            motion = REST if mode is StopMode.ABRUPT else self._ramp_to_rest
             if self._trajectory.known:
                 speed = abs(self._trajectory.velocity_at(HostNs(effective)))
                 if mode is StopMode.ABRUPT:
@@ -276,17 +277,25 @@ class TicLens:
 
     def _go(self, target: int, speed_sps: float, name: str, stops: int) -> CommandStamp:
         self._prepare()
-        word = max(1, round(speed_sps * 10_000))
-        data = b"" if word == self._speed_word else self._frame(wire.SET_MAX_SPEED, long_word(word))
-        data += self._frame(wire.SET_TARGET_POSITION, long_word(target))
+        aim = self._frame(wire.SET_TARGET_POSITION, long_word(target))
+        limit = self._frame(wire.SET_MAX_SPEED, long_word(max(1, round(speed_sps * 10_000))))
+        motion = Motion(self._limits.acceleration_sps2, target_steps=float(target), speed_sps=speed_sps)
+        # in motion the target goes first: another speed limit alone would accelerate towards the old target
+        steps: list[tuple[bytes, Motion | None]]
+        steps = [(aim, replace(motion, speed_sps=self._speed_sps)), (limit, motion)]
+        if self._speed_sps == speed_sps:
+            steps = [(aim, motion)]
+        elif self._rest_due_ns is None:
+            steps = [(limit, None), (aim, motion)]
         begun = self._clock.now_ns()
-        self._write(data)
+        self._write(b"".join(data for data, _ in steps))
         done = self._clock.now_ns()
-        self._speed_word = word
+        self._speed_sps = speed_sps
         with self._lock:
-            effective = self._on_wire(len(data), begun) + self._latency_ns
-            motion = Motion(self._limits.acceleration_sps2, target_steps=float(target), speed_sps=speed_sps)
-            self._trajectory.command(motion, effective, self._sigma_ns)
+            for data, planned in steps:
+                effective = self._on_wire(len(data), begun) + self._latency_ns
+                if planned is not None:
+                    self._trajectory.command(planned, effective, self._sigma_ns)
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 50 * NS_PER_MS
             self._halted_softly = False
             self._stops_ignored = 0
