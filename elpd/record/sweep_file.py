@@ -105,6 +105,7 @@ class SweepSearch:
         self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX)
         self._first = int(np.searchsorted(sweep.t_us, self._begin_us, side="left"))
         self._memory = EventMemory(roi, sweep.geometry)
+        self._attempts = 0
         self._attempts_until = 0
         self._width: float | None = None
         self._doubtful: Detection | None = None
@@ -182,7 +183,9 @@ class SweepSearch:
             witnesses.append(frame_witness(vertex, spacing))
         elif not self._image_peak_passed():
             return None
-        self._attempts_until = self._detector.samples + _RETRY_EVERY
+        # An attempt costs many windows' worth of work, so the longer it goes on in vain, the rarer it gets.
+        self._attempts += 1
+        self._attempts_until = self._detector.samples + max(_RETRY_EVERY, self._attempts)
         brightness = None if self._reference is None else self._reference.brightness
         said, self._width = self._memory.witnesses(now_us, self._ruler, brightness)
         witnesses += said
