@@ -168,7 +168,7 @@ class FocusCycle:
         picture = self._picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._choose(picture)
-        watch = self._arm(reference, roi)
+        watch = self._arm(reference, roi, frames=picture.map is None)
         if self._request.dry_run:
             raise _Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         passed = self._search(watch)
@@ -230,7 +230,7 @@ class FocusCycle:
             )
         return roi, reference
 
-    def _arm(self, reference: Reference, roi: Roi) -> Watch:
+    def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
         camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
@@ -242,7 +242,7 @@ class FocusCycle:
             reference,
             roi,
             geometry,
-            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=self.map is None),
+            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=frames),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
         )
