@@ -420,7 +420,9 @@ class FocusCycle:
         """Return where the lens rests: by its newest report if that says so, else after waiting for one."""
         report = self._stage.report
         resting = report is not None and not report.moving and self._phases[-1][0] is Phase.VERIFY
-        return self._stage.to_um(report.steps if resting and report is not None else self._stage.rest(REST_LIMIT_MS).steps)
+        return self._stage.to_um(
+            report.steps if resting and report is not None else self._stage.rest(REST_LIMIT_MS).steps
+        )
 
     def _here_um(self) -> float:
         return self._stage.to_um(self._parts.lens.position_at(self._stage.now_ns()).steps)
