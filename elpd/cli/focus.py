@@ -48,12 +48,17 @@ def command(
         dry_run=dry_run,
     )
     from elpd.cli.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
-    from elpd.cli.view import plain_view  # noqa: PLC0415
+    from elpd.cli.view import open_view  # noqa: PLC0415
 
     cancelled = threading.Event()
     previous = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
     try:
-        session = focus_once(config, request, None if as_json else plain_view(), cancelled.is_set)
+        if as_json:
+            session = focus_once(config, request, None, cancelled.is_set)
+        else:
+            with open_view() as view:
+                session = focus_once(config, request, view, cancelled.is_set)
+                view.result(session.result)
     finally:
         signal.signal(signal.SIGINT, previous)
     if as_json:

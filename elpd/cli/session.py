@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd import rig
+from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.record.journal import RunWriter
@@ -54,6 +56,10 @@ def focus_once(
     """
     parts = rig.build(config)
     try:
+        if request.reference is not None and request.reference.suffix == ".npz":
+            here_um = parts.lens.position_at(parts.clock.now_ns()).steps * parts.um_per_step
+            depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um
+            stored_map.load(request.reference).check(parts.camera.geometry, here_um, depth_of_focus_um, time.time())
         with RunWriter.begin(config, request, parts) as run:
             settings = CycleSettings.from_config(config)
             cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))

@@ -103,6 +103,7 @@ class ElpWindows:
         self._triggers = new_triggers()
         self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
+        self._pending = (np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64))
         self._words = (
             {
                 Encoding.EVT3: elp_words.evt3_to_windows_capped,
@@ -173,17 +174,18 @@ class ElpWindows:
         if packet.encoding is Encoding.ARRAY:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
         sum_words = self._words[packet.encoding]
+        scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
         words = packet.data
         window = self._window
         window[N_ROWS] = 0
         position = sum_words(
-            words, 0, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us, self._bucket
+            words, 0, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us, *scratch
         )
         while window[PAUSED]:
             self._make_room()
             position = sum_words(
                 words, position, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us,
-                self._bucket,
+                *scratch,
             )  # fmt: skip
         return self._closed[: window[N_ROWS]]
 

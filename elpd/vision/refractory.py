@@ -1,13 +1,13 @@
 """How long a pixel is deaf after an event, measured from the events themselves.
 
-After an event a pixel is held in reset for its refractory period, and what the light does in that time is lost: the next
-threshold is counted from the brightness at *release*, not at the event. So the level that an event stands for is that of
-its release, and every position read off event times is early by the refractory period times the lens speed: half a
-millisecond at 4 mm/s is 2 um, a third of a depth of focus. Dating events to their release removes it, on both sides of
-focus alike (a pair's halves then lie at equal levels again).
+After an event a pixel is held in reset for its refractory period, and what the light does in that time is lost: the
+next threshold is counted from the brightness at *release*, not at the event. So the level that an event stands for is
+that of its release, and every position read off event times is early by the refractory period times the lens speed:
+half a millisecond at 4 mm/s is 2 um, a third of a depth of focus. Dating events to their release removes it, on both
+sides of focus alike (a pair's halves then lie at equal levels again).
 
-Nobody knows the period of a given sensor and bias; but no two events of one pixel are closer than it, and noise sees to it
-that some nearly are. The fifth shortest interval among ten thousands is the period to a few per cent.
+Nobody knows the period of a given sensor and bias; but no two events of one pixel are closer than it, and noise sees to
+it that some nearly are. The fifth shortest interval among ten thousands is the period to a few per cent.
 """
 
 from __future__ import annotations

@@ -23,17 +23,15 @@ def slow_shortest(events: list[tuple[int, int, int]], keep: int) -> tuple[list[i
     st.integers(1, 9),
     st.integers(0, 80),
 )
-def test_the_kernel_is_its_slow_twin_for_any_split(
-    steps: list[tuple[int, int, int]], keep: int, cut: int
-) -> None:
+def test_the_kernel_is_its_slow_twin_for_any_split(steps: list[tuple[int, int, int]], keep: int, cut: int) -> None:
     t = np.cumsum(np.array([step for step, _, _ in steps], np.int64))
     x = np.array([x for _, x, _ in steps], np.uint16)
     y = np.array([y for _, _, y in steps], np.uint16)
     last, shortest = np.full((3, 4), -1, np.int64), np.full(keep, FOREVER)
-    count = sum(shortest_intervals(t[part], x[part], y[part], last, shortest) for part in (slice(cut), slice(cut, None)))
-    assert (shortest.tolist(), count) == slow_shortest(
-        list(zip(t.tolist(), x.tolist(), y.tolist(), strict=True)), keep
+    count = sum(
+        shortest_intervals(t[part], x[part], y[part], last, shortest) for part in (slice(cut), slice(cut, None))
     )
+    assert (shortest.tolist(), count) == slow_shortest(list(zip(t.tolist(), x.tolist(), y.tolist(), strict=True)), keep)
 
 
 def deaf_pixels(period_us: int, grid_us: int = 1) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16]]:

@@ -86,6 +86,7 @@ class SimSettings:
     contrast_on: float = FOCUS.c_on
     contrast_off: float = FOCUS.c_off
     refractory_us: int = FOCUS.refractory_us
+    memories: bool = True
     ring_packets: int = RING_PACKETS
     # aperture
     aperture_ms: float = 20.0
@@ -303,6 +304,7 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         leak_hz=chosen.leak_hz,
         hot_pixels=chosen.hot_pixels,
         focus=BiasLevels(chosen.contrast_on, chosen.contrast_off, chosen.refractory_us),
+        memories=chosen.memories,
     )
     davis = chosen.camera == "davis346"
     frames = ApsFrames(width, height, random_stream(seed, "frames")) if davis else None
