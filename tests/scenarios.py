@@ -25,7 +25,7 @@ from elpd.units import NS_PER_MS, HostNs, after_ms
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from elpd.ports import Aperture, Clock, Lens, RigParts
+    from elpd.ports import Lens, RigParts
     from elpd.records import Geometry, LensCapabilities, LensLimits, PositionEstimate
     from elpd.units import Steps
 
@@ -183,7 +183,7 @@ def _one_ending(story: Story) -> None:
 
 
 def _limits_held(story: Story) -> None:
-    times = story._history_ns()  # noqa: SLF001
+    times = story._history_ns()
     limits, mechanism = story.parts.lens.limits, story.truth.mechanism
     asked = mechanism.motor_steps(times)
     assert asked.min() >= limits.min_steps - 1, "the motor was sent below its limits"

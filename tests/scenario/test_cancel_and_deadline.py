@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from scenarios import Event, Story, assert_invariants, play
 
 from elpd.records import Outcome
-from scenarios import Event, Story, assert_invariants, play
 
 MOMENTS = [
     ("settle_before", 1.0),
