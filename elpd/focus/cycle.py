@@ -151,7 +151,7 @@ class FocusCycle:
                 outcome, reason = ended.outcome, ended.reason
                 self._go_to_declared_place()
             self._stage.interrupt = None
-            final_um = self._stage.to_um(self._stage.rest(REST_LIMIT_MS).steps)
+            final_um = self._rest_um()
         except DeviceError:
             self._stop_hard()
             raise
@@ -365,11 +365,13 @@ class FocusCycle:
         before = watch.events_in_cycle
         stage.listener = watch.count
         beyond_um = estimate.focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM)
+        rest = None
         for target_um in (beyond_um, estimate.focus_um):
             bounded = min(max(stage.to_steps(target_um), limits.min_steps), limits.max_steps)
-            stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
+            rest = stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
         self._phase(Phase.VERIFY)
-        rest = stage.rest(REST_LIMIT_MS)
+        if rest is None:
+            raise AssertionError("two moves end in a rest")
         error_um = stage.to_um(rest.steps) - estimate.focus_um
         if abs(error_um) > max(0.25 * settings.depth_of_focus_um, 2 * stage.um_per_step):
             raise _Ended(
@@ -415,6 +417,14 @@ class FocusCycle:
         if not capabilities.abrupt_stop:
             ramp_um = speed_um_s**2 / (2 * self._stage.to_um(limits.acceleration_sps2))
         return speed_um_s * onset_ms / 1000.0 + ramp_um
+
+    def _rest_um(self) -> float:
+        """Return where the lens rests: by its newest report if that says so, else after waiting for one."""
+        report = self._stage.report
+        resting = report is not None and not report.moving and self._phases[-1][0] is Phase.VERIFY
+        return self._stage.to_um(
+            report.steps if resting and report is not None else self._stage.rest(REST_LIMIT_MS).steps
+        )
 
     def _here_um(self) -> float:
         return self._stage.to_um(self._parts.lens.position_at(self._stage.now_ns()).steps)

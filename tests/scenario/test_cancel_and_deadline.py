@@ -1,4 +1,4 @@
-"""Whoever asks for an end gets one, in every phase: the stop leaves at once, and the lens goes to its declared place."""
+"""Whoever asks for an end gets one, in every phase: the stop leaves at once, the lens goes to its declared place."""
 
 from __future__ import annotations
 
