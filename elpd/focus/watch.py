@@ -49,6 +49,9 @@ LOOK_BACK_DOF = 12.0
 TICK_DOF = 0.5
 """Travel between two looks at the sharpness of the image that the events build."""
 
+PATIENCE_DOF = 8.0
+"""How far beyond a sign change of ELP the image's sharpness may take to agree: a curve's width and a half."""
+
 LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
@@ -128,7 +131,7 @@ class Watch:
         self._detector = Detector()
         self._decoder = PacketDecoder(geometry)
         self._memory = EventMemory(roi, geometry)
-        self._ticked_um = float("nan")
+        self._ticked_um = self._here_um = float("nan")
         self._passed = False
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
@@ -173,7 +176,7 @@ class Watch:
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
         self._memory = EventMemory(self._roi, self._geometry)
-        self._ticked_um = float("nan")
+        self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
@@ -230,7 +233,7 @@ class Watch:
         """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
             return
-        self._ticked_um = end_um
+        self._ticked_um = self._here_um = end_um
         self._memory.advance(sample.end_us, self._sign * end_um)
 
     @property
@@ -244,7 +247,16 @@ class Watch:
 
     @property
     def direction(self) -> Direction:
-        """Where focus lies, as far as the events have said."""
+        """Where focus lies, as far as the events have said.
+
+        Once ELP has said "ahead", a change of its mind is no reason to turn round at once: with a picture from far away
+        it comes some depths of focus early, and the sharpness of the image has the say.
+        """
+        mutation = self._detector.mutation
+        if mutation is not None and not self._passed:
+            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
+            if beyond_um < PATIENCE_DOF * self._settings.depth_of_focus_um:
+                return Direction.APPROACHING
         return self._detector.direction
 
     @property
