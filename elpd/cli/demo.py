@@ -201,10 +201,10 @@ def _tell(shown: Demonstration, config: Config, stream: TextIO) -> None:
     if session.run is not None:
         both = np.hstack([shown.before, shown.after])
         save_png(session.run / "before-after.png", both, limits)
-        lines.append(
-            f"Recorded in {session.run}, with before-after.png of the whole sensor; "
-            f"`elpd replay {session.run}` decides the same again."
-        )
+        lines += [
+            f"Recorded in {session.run}, with before-after.png of the whole sensor.",
+            f"`elpd replay {session.run}` decides the same again.",
+        ]
     print(*lines, sep="\n", file=stream, flush=True)
 
 
@@ -213,22 +213,26 @@ def _numbers(shown: Demonstration, config: Config) -> list[str]:
     result, truth = session.result, session.truth or {}
     lines = []
     if session.focused:
-        told = [
-            f"the estimate is {_um(truth.get('estimate_error_um'))} from true focus",
-            f"the motor stopped at {_um(truth.get('stop_error_um'))} and went back",
-            f"the lens rests {_um(truth.get('final_error_um'))} from focus",
+        lines += [
+            f"In focus. The lens rests {_um(truth.get('final_error_um'))} from true focus; the depth of focus is "
+            f"{config.sim.depth_of_focus_um:g} um.",
+            f"The estimate was {_um(truth.get('estimate_error_um'))} off; the motor had stopped at "
+            f"{_um(truth.get('stop_error_um'))} and went back.",
         ]
-        lines.append(f"In focus: {'; '.join(told)} (depth of focus {config.sim.depth_of_focus_um:g} um).")
     else:
         lines.append(f"Not in focus: {result.outcome.value}, {result.reason}.")
-    took = f"The cycle took {result.duration_ms:.0f} ms of the rig's time and {shown.wall_ms:.0f} ms here"
+    took = f"It took {result.duration_ms:.0f} ms of the rig's time, {shown.wall_ms:.0f} ms here"
     if config.sim.pace == 0:
-        lines.append(f"{took} (virtual time, as fast as the CPU can).")
+        lines.append(f"{took}: virtual time, as fast as this machine can.")
     elif shown.behind_ms > 1000.0 * KEPT_PACE_S:
-        pace = "real time" if config.sim.pace == 1 else f"{config.sim.pace:g} of real time"
-        lines.append(f"{took}: simulating fell {shown.behind_ms:.0f} ms behind {pace}, which changes no decision.")
+        lines += [
+            f"{took}: simulating a sensor of this size fell {shown.behind_ms:.0f} ms",
+            f"behind {'' if config.sim.pace == 1 else f'{config.sim.pace:g} times '}real time; no decision depends on it.",
+        ]
     else:
-        lines.append(f"{took}, at the wall clock's pace.")
+        lines.append(
+            f"{took}, at {'' if config.sim.pace == 1 else f'{config.sim.pace:g} times '}the wall clock's pace."
+        )
     return lines
 
 
