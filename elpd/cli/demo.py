@@ -213,26 +213,22 @@ def _numbers(shown: Demonstration, config: Config) -> list[str]:
     result, truth = session.result, session.truth or {}
     lines = []
     if session.focused:
-        lines += [
-            f"In focus. The lens rests {_um(truth.get('final_error_um'))} from true focus; the depth of focus is "
-            f"{config.sim.depth_of_focus_um:g} um.",
-            f"The estimate was {_um(truth.get('estimate_error_um'))} off; the motor had stopped at "
-            f"{_um(truth.get('stop_error_um'))} and went back.",
-        ]
+        rest, off, stop = (_um(truth.get(f"{name}_error_um")) for name in ("final", "estimate", "stop"))
+        depth_um = config.sim.depth_of_focus_um
+        lines.append(f"In focus. The lens rests {rest} from true focus; the depth of focus is {depth_um:g} um.")
+        lines.append(f"The estimate was {off} off; the motor had stopped at {stop} and went back.")
     else:
         lines.append(f"Not in focus: {result.outcome.value}, {result.reason}.")
     took = f"It took {result.duration_ms:.0f} ms of the rig's time, {shown.wall_ms:.0f} ms here"
     if config.sim.pace == 0:
         lines.append(f"{took}: virtual time, as fast as this machine can.")
-    elif shown.behind_ms > 1000.0 * KEPT_PACE_S:
-        lines += [
-            f"{took}: simulating a sensor of this size fell {shown.behind_ms:.0f} ms",
-            f"behind {'' if config.sim.pace == 1 else f'{config.sim.pace:g} times '}real time; no decision depends on it.",
-        ]
     else:
-        lines.append(
-            f"{took}, at {'' if config.sim.pace == 1 else f'{config.sim.pace:g} times '}the wall clock's pace."
-        )
+        pace = "real time" if config.sim.pace == 1 else f"{config.sim.pace:g} times real time"
+        if shown.behind_ms > 1000.0 * KEPT_PACE_S:
+            lines.append(f"{took}: simulating a sensor of this size fell {shown.behind_ms:.0f} ms")
+            lines.append(f"behind {pace}. No decision depends on it.")
+        else:
+            lines.append(f"{took}, in {pace}.")
     return lines
 
 
