@@ -38,6 +38,10 @@ LEAST_LEVEL = 1.0 / 3.0
 """Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
 event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
 
+LEAST_ORDER = 0.75
+"""Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
+motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
+
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
 
@@ -66,6 +70,7 @@ class EventMemory:
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
+        self._forgotten = 0
         self.capped = 0
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
@@ -98,6 +103,7 @@ class EventMemory:
         self._columns = columns
         self._count -= drop
         self._taken -= drop
+        self._forgotten += drop
 
     @property
     def _t_us(self) -> NDArray[np.int64]:
@@ -124,8 +130,18 @@ class EventMemory:
         track = self.track
         if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
             return False
+        if not self._shows_a_picture():
+            return False
         begin_us = track.times_us[track.flank(FLANK)]
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
+
+    def _shows_a_picture(self) -> bool:
+        """Whether the image is sharper, at its peak, than as many events at random would have made it."""
+        track = self.track
+        height, width = self._shape
+        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
+        at_random = band_gain(BANDS_PX[0]) * until / (height * width)
+        return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 
     def ask(
         self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None, deaf_us: float = 0.0
