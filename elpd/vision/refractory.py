@@ -37,7 +37,7 @@ GRID_COUNT = 250
 """So many intervals exactly alike and shortest, and the time stamps are on a grid: it hides the period."""
 
 CROWDING = 3.0
-"""How many times more intervals in the farther half of the stretch above the shortest than in the nearer are a crowd."""
+"""How many times more intervals in the farther half above the shortest than in the nearer half are a crowd."""
 
 
 @dataclass(frozen=True, slots=True)
