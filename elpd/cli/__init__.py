@@ -14,7 +14,7 @@ from typing import cast
 
 import click
 
-from elpd import __version__
+from elpd import __version__, log
 from elpd.cli.common import report_error
 from elpd.errors import ElpdError
 
@@ -55,8 +55,10 @@ class LazyGroup(click.Group):
 
 @click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="elpd")
-def root() -> None:
+@click.option("--verbose", "-v", is_flag=True, help="Log what happens, to stderr.")
+def root(*, verbose: bool) -> None:
     """Real-time autofocus for event cameras."""
+    log.configure(verbose=verbose)
 
 
 def main() -> None:

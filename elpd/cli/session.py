@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import structlog
+
 from elpd import rig
 from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
@@ -80,4 +82,5 @@ def focus_on(
         result = cycle.run()
         truth = None if parts.truth is None else parts.truth.errors(result)
         run.finish(result_fields(result), truth=truth)
+    structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
     return Session(result, truth, run.path, cycle.map)

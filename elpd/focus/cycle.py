@@ -97,7 +97,7 @@ class FocusCycle:
     observer
         Somebody who watches; never waited for.
     cancelled
-        Asked once per turn of the loop; true ends the cycle as CANCELLED.
+        Asked once per turn of any loop, in every phase; true ends the cycle as CANCELLED.
 
     """
 
@@ -145,10 +145,12 @@ class FocusCycle:
         try:
             self._parts.camera.start()
             try:
+                self._stage.interrupt = self._interrupt
                 outcome, reason = self._focus()
             except _Ended as ended:
                 outcome, reason = ended.outcome, ended.reason
                 self._go_to_declared_place()
+            self._stage.interrupt = None
             final_um = self._rest_um()
         except DeviceError:
             self._stop_hard()
@@ -265,7 +267,7 @@ class FocusCycle:
             turn_s += REJOG_S
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
-        self._stage.listener = None
+        self._stage.listener = self._stage.interrupt = None  # the sweep asks for itself, and stops the lens first
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
@@ -295,7 +297,7 @@ class FocusCycle:
                 reason=report.verdict.reason,
             )
             if report.end is SweepEnd.PASSED:
-                self._stage.listener = watch.keep
+                self._stage.listener, self._stage.interrupt = watch.keep, self._interrupt
                 return report
             if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
                 raise self._rule(report.verdict)
@@ -427,6 +429,13 @@ class FocusCycle:
     def _here_um(self) -> float:
         return self._stage.to_um(self._parts.lens.position_at(self._stage.now_ns()).steps)
 
+    def _interrupt(self) -> None:
+        """End a phase that waits, if somebody asked for it or time is up."""
+        ms_to_deadline = (self._deadline_ns - self._stage.now_ns()) / NS_PER_MS
+        verdict = safety.decide(safety.Conditions(cancelled=self._cancelled(), ms_to_deadline=ms_to_deadline))
+        if verdict.action is not safety.Action.CONTINUE:
+            raise self._rule(verdict)
+
     def _rule(self, verdict: safety.Verdict) -> Exception:
         if verdict.action is safety.Action.FAULT:
             return CameraError(verdict.reason)
@@ -436,7 +445,7 @@ class FocusCycle:
 
     def _go_to_declared_place(self) -> None:
         """After anything but FOCUSED: hold, start or preset. A *settled* start, read before anything moved."""
-        self._stage.listener = None
+        self._stage.listener = self._stage.interrupt = None
         self._parts.lens.stop(StopMode.RAMPED)
         self._stage.rest(REST_LIMIT_MS)
         place = {"hold": None, "start": self._start_um, "preset": self._settings.preset_um}[self._settings.on_failure]

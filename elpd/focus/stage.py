@@ -42,6 +42,8 @@ class Stage:
         self.last_packet_ns = parts.clock.now_ns()
         self.listener: Callable[[CameraPacket], object] | None = None
         """Hears every packet that is read while a phase waits."""
+        self.interrupt: Callable[[], None] | None = None
+        """Asked before every read; raises to end the phase."""
 
     # --- time and place ---
 
@@ -66,8 +68,10 @@ class Stage:
     def read(self, timeout_s: float = READ_TIMEOUT_S) -> CameraPacket | None:
         """Read one packet, poll the lens once, keep the counters.
 
-        Raises ``CameraError`` after 200 ms of silence, ``LensError`` from the lens.
+        Raises ``CameraError`` after 200 ms of silence, ``LensError`` from the lens, and whatever ``interrupt`` does.
         """
+        if self.interrupt is not None:
+            self.interrupt()
         packet = self.parts.camera.read(timeout_s)
         report = self.parts.lens.poll()
         if report is not None:

@@ -49,10 +49,17 @@ LOOK_BACK_DOF = 12.0
 TICK_DOF = 0.5
 """Travel between two looks at the sharpness of the image that the events build."""
 
+PATIENCE_DOF = 8.0
+"""How far beyond a sign change of ELP the image's sharpness may take to agree: a curve's width and a half."""
+
 LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
 
+
+FAR_DROP = 0.2
+"""Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
+answers are worth the few micrometres."""
 
 SIGMAS_AFTER_REVERSAL = 9.0
 """A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
@@ -124,7 +131,7 @@ class Watch:
         self._detector = Detector()
         self._decoder = PacketDecoder(geometry)
         self._memory = EventMemory(roi, geometry)
-        self._ticked_um = float("nan")
+        self._ticked_um = self._here_um = float("nan")
         self._passed = False
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
@@ -169,7 +176,7 @@ class Watch:
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
         self._memory = EventMemory(self._roi, self._geometry)
-        self._ticked_um = float("nan")
+        self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
@@ -201,7 +208,7 @@ class Watch:
                 continue
             self._detector.feed(sample)
             seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if seen and not self._passed and self._memory.peak_passed:
+            if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
@@ -226,7 +233,7 @@ class Watch:
         """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
             return
-        self._ticked_um = end_um
+        self._ticked_um = self._here_um = end_um
         self._memory.advance(sample.end_us, self._sign * end_um)
 
     @property
@@ -240,7 +247,16 @@ class Watch:
 
     @property
     def direction(self) -> Direction:
-        """Where focus lies, as far as the events have said."""
+        """Where focus lies, as far as the events have said.
+
+        Once ELP has said "ahead", a change of its mind is no reason to turn round at once: with a picture from far away
+        it comes some depths of focus early, and the sharpness of the image has the say.
+        """
+        mutation = self._detector.mutation
+        if mutation is not None and not self._passed:
+            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
+            if beyond_um < PATIENCE_DOF * self._settings.depth_of_focus_um:
+                return Direction.APPROACHING
         return self._detector.direction
 
     @property
@@ -260,13 +276,19 @@ class Watch:
             return None
         memory = self._memory
         ruler = self._ruler(self._begun_us, self.decided_us)
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, memory.refractory_us())
+        deaf = memory.refractory()
+        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
         if said is None:
             return None
-        unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
+        speed_um_us = 1e-6 * self._settings.speed_um_s
+        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
-        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um, unexplained, width_um)])
+        witnesses = [
+            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
+            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+        ]
+        found = fuse([*self._ask_frames(), *witnesses])
         if found is None:
             return None
         sign = self._sign

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
+from elpd.events.epoch import enter_epoch
 from elpd.events.layout import event_columns
 from elpd.events.registers import (
     counters,
@@ -173,6 +174,7 @@ class ElpWindows:
         until_us = NEVER if packet.complete_until_us is None else packet.complete_until_us
         if packet.encoding is Encoding.ARRAY:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
+        enter_epoch(packet, self._state)
         sum_words = self._words[packet.encoding]
         scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
         words = packet.data

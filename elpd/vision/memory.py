@@ -16,7 +16,7 @@ import numpy as np
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.integral import BANDS_PX, band_gain
-from elpd.vision.refractory import refractory_period_us
+from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -110,10 +110,10 @@ class EventMemory:
         times: NDArray[np.int64] = self._columns[0][: self._count]
         return times
 
-    def refractory_us(self) -> float:
-        """Return how long a pixel is deaf after an event, as far as the events tell (``refractory``); 0 if not."""
+    def refractory(self) -> Refractory:
+        """Return how long a pixel is deaf after an event, as far as the events tell."""
         t_us, x, y, _ = (column[: self._count] for column in self._columns)
-        return refractory_period_us(t_us, x, y, self._shape)
+        return refractory_period(t_us, x, y, self._shape)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
