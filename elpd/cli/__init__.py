@@ -41,9 +41,8 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import the command's module and return its ``command``."""
-        del ctx
         if cmd_name not in COMMANDS:
-            return None
+            ctx.fail(f"there is no command {cmd_name!r}; there are {', '.join(sorted(COMMANDS))}")
         module = importlib.import_module(f"elpd.cli.{cmd_name.replace('-', '_')}")
         return cast("click.Command", module.command)
 
@@ -54,7 +53,7 @@ class LazyGroup(click.Group):
             formatter.write_dl(sorted(COMMANDS.items()))
 
 
-@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="elpd")
 @click.option("--verbose", "-v", is_flag=True, help="Log what happens, to stderr.")
 def root(*, verbose: bool) -> None:
@@ -74,11 +73,13 @@ def main() -> None:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except click.ClickException as error:
-        report_error("UsageError", error.format_message(), as_json=as_json)
+        report_error("UsageError", f"{error.format_message().rstrip('.')}; see `elpd --help`", as_json=as_json)
         sys.exit(2)
     except ElpdError as error:
         report_error(error.kind, str(error), as_json=as_json)
         sys.exit(error.exit_code)
-    except BrokenPipeError:
-        sys.exit(0)
+    except OSError as error:  # a file or folder that is not ours to read or write; devices raise their own
+        where = f"{error.filename}: " if error.filename else ""
+        report_error("UsageError", f"{where}{error.strerror or error}", as_json=as_json)
+        sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

@@ -15,15 +15,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import click
+import cv2
+import numpy as np
 
 from elpd.cli.common import config_options, interruptible, json_option, print_json
+from elpd.cli.drawing import picture, save_png, side_by_side
+from elpd.cli.view import LiveView, Seen, frame, ink_of, open_view
 from elpd.config import Config, load
 from elpd.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from elpd.cli.session import Session
@@ -35,6 +38,8 @@ DEMO_RIG = ("sim.seed=7", "sim.scene=camera", "sim.start_um=-200", "sim.pace=1")
 
 MAGNIFIED_PX = 96
 """Side of the part of the scene that is drawn before and after: a terminal has no room for a whole sensor."""
+
+PICTURE = "before-after.png"
 
 COLUMNS = 80
 """Where there is no terminal to ask."""
@@ -72,6 +77,17 @@ class Demonstration:
     start_error_um: float
     behind_ms: float
     wall_ms: float
+
+    def cut(self) -> tuple[slice, slice]:
+        """Return the part of the region that is worth drawing."""
+        height, width = self.after.shape
+        region = self.session.result.details.get("roi", (0, 0, width, height))
+        return magnified(self.after, tuple(region), MAGNIFIED_PX)
+
+    def limits(self) -> tuple[float, float]:
+        """Return the black and the white of both pictures."""
+        low, high = np.percentile(self.after[self.cut()], (1, 99))
+        return float(low), float(high)
 
     def fields(self) -> dict[str, Any]:
         """Return the JSON of `elpd demo`: that of `elpd focus`, and how well the wall clock was kept up with."""
@@ -114,6 +130,8 @@ def run(config: Config, stream: TextIO | None) -> Demonstration:
         shown = Demonstration(session, before, truth.picture(), start_error_um, max(0.0, 1000.0 * lag_s), wall_ms)
     finally:
         rig.release(parts)
+    if session.run is not None:
+        save_png(session.run / PICTURE, np.hstack([shown.before, shown.after]), shown.limits())
     if stream is not None:
         _tell(shown, config, stream)
     return shown
@@ -123,8 +141,6 @@ class Audience:
     """Watches a cycle: a live drawing in a terminal, else plain lines and the finished drawing."""
 
     def __init__(self, stream: TextIO) -> None:
-        from elpd.cli.view import LiveView, Seen, open_view  # noqa: PLC0415
-
         self._stream = stream
         self._view: View = open_view(stream)
         self._drawn = isinstance(self._view, LiveView)
@@ -137,8 +153,6 @@ class Audience:
     def __exit__(self, *raised: object) -> None:
         self._view.__exit__(*raised)
         if not self._drawn and self._seen.elps:
-            from elpd.cli.view import frame  # noqa: PLC0415
-
             print("", *frame(self._seen, COLUMNS, colour=False)[1:-1], "", sep="\n", file=self._stream)
 
     def phase(self, name: str, /, **fields: Any) -> None:
@@ -156,13 +170,10 @@ class Audience:
         self._view.result(session.result)
 
 
-def magnified(picture: NDArray[np.float32], window: tuple[int, int, int, int], side_px: int) -> tuple[slice, slice]:
+def magnified(image: NDArray[np.float32], window: tuple[int, int, int, int], side_px: int) -> tuple[slice, slice]:
     """Return the square of *side_px* inside *window* (x, y, width, height) whose fine structure is strongest."""
-    import cv2  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
-
     x, y, width, height = window
-    part = picture[y : y + height, x : x + width]
+    part = image[y : y + height, x : x + width]
     across, down = min(side_px, part.shape[1]), min(side_px, part.shape[0])
     fine = cv2.Laplacian(part, cv2.CV_32F) ** 2
     total = cv2.boxFilter(fine, cv2.CV_32F, (across, down), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
@@ -182,29 +193,16 @@ def _hello(config: Config) -> None:
 
 def _tell(shown: Demonstration, config: Config, stream: TextIO) -> None:
     """Draw the scene before and after, then say the numbers."""
-    import numpy as np  # noqa: PLC0415
-
-    from elpd.cli.drawing import picture, save_png, side_by_side  # noqa: PLC0415
-    from elpd.cli.view import ink_of  # noqa: PLC0415
-
-    session = shown.session
-    height, width = shown.after.shape
-    cut = magnified(shown.after, tuple(session.result.details.get("roi", (0, 0, width, height))), MAGNIFIED_PX)
-    before, after = shown.before[cut], shown.after[cut]
-    limits = (float(np.percentile(after, 1)), float(np.percentile(after, 99)))
+    before, after = shown.before[shown.cut()], shown.after[shown.cut()]
     columns = (min(100, (shutil.get_terminal_size().columns if stream.isatty() else COLUMNS) - 1) - 2) // 2
     ink = ink_of(stream)
-    left, right = (picture(part, columns, ink=ink, limits=limits) for part in (before, after))
+    left, right = (picture(part, columns, ink=ink, limits=shown.limits()) for part in (before, after))
     titles = (f"before, {shown.start_error_um:+.1f} um from focus"[:columns], "after")
     print(side_by_side(left, right, titles, columns), file=stream)
     lines = ["", *_numbers(shown, config)]
-    if session.run is not None:
-        both = np.hstack([shown.before, shown.after])
-        save_png(session.run / "before-after.png", both, limits)
-        lines += [
-            f"Recorded in {session.run}, with before-after.png of the whole sensor.",
-            f"`elpd replay {session.run}` decides the same again.",
-        ]
+    if shown.session.run is not None:
+        lines.append(f"Recorded in {shown.session.run}, with {PICTURE} of the whole sensor.")
+        lines.append(f"`elpd replay {shown.session.run}` decides the same again.")
     print(*lines, sep="\n", file=stream, flush=True)
 
 

@@ -14,6 +14,7 @@ import os
 import shutil
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, Self, TextIO
 
@@ -90,12 +91,13 @@ class PlainView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stream.flush()
+        with suppress(OSError, ValueError):
+            self._stream.flush()
 
     def phase(self, name: str, /, **fields: Any) -> None:
         """Print the phase's name and what came with it."""
         windows = f"  ({self._windows} windows)" if self._windows and name != Phase.PROBE.value else ""
-        print(f"{name:14s}{_described(fields)}{windows}".rstrip(), file=self._stream, flush=True)
+        self._say(f"{name:14s}{_described(fields)}{windows}".rstrip())
 
     def sample(self, sample: ElpSample, score: float, /) -> None:
         """Count."""
@@ -104,7 +106,11 @@ class PlainView:
 
     def result(self, result: FocusResult, /) -> None:
         """Print the outcome in one line."""
-        print(result_line(result), file=self._stream, flush=True)
+        self._say(result_line(result))
+
+    def _say(self, line: str) -> None:
+        with suppress(OSError, ValueError):  # nobody listens any more: no reason to disturb a cycle
+            print(line, file=self._stream, flush=True)
 
 
 @dataclass(slots=True)
