@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 from elpd_drivers.sim.boards.tic import TicBoard
+from scenarios import CAMERA_STOP_LIMIT_MS, Event, Story, assert_invariants, play
 
 from elpd.errors import CameraError, LensError
-from scenarios import CAMERA_STOP_LIMIT_MS, Event, Story, assert_invariants, play
 
 SWEEP_FROM_S = 0.13
 CAMERA_BATCH_MS = 3.0

@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pytest
 from elpd_drivers.sim.scene import scene_canvas
+from scenarios import Event, SpyLens, Story, assert_invariants, play
 
 from elpd.focus.settings import FocusRequest
-from elpd.records import LensReport, Outcome, Roi
-from scenarios import Event, SpyLens, Story, assert_invariants, play
+from elpd.records import CommandStamp, Outcome, Roi
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from elpd.units import HostNs
 
 
 @pytest.fixture
@@ -130,16 +132,11 @@ def test_shedding_more_than_a_fifth_is_refused() -> None:
 
 
 class SilentMotor(SpyLens):
-    """A controller whose reports stand still whatever it is told, as with a motor that is not energised."""
+    """A controller that takes every order and does not step, as with a motor that is not energised."""
 
-    _first: LensReport | None = None
-
-    def poll(self) -> LensReport | None:
-        report = self.inner.poll()
-        if report is None:
-            return None
-        self._first = self._first or report
-        return LensReport(self._first.steps, report.earliest_ns, report.latest_ns, 0.0, self._first.flags)
+    def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
+        now = self.story.parts.clock.now_ns()
+        return CommandStamp("run", now, now)
 
 
 def test_reports_that_stand_still_under_command_mean_a_lens_that_did_not_move() -> None:
