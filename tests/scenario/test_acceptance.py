@@ -6,13 +6,20 @@
 from __future__ import annotations
 
 import statistics
+from typing import TYPE_CHECKING
 
+import cv2
+import numpy as np
 import pytest
+from elpd_drivers.sim.scene import scene_canvas
 from scenarios import assert_invariants, play
 
+from elpd.focus.settings import FocusRequest
 from elpd.records import Outcome
 
-SEEDS = range(30)
+if TYPE_CHECKING:
+    from pathlib import Path
+
 REVERSAL_UM = 10.0
 MEDIAN_TIC_UM = 1.0
 MEDIAN_GRBL_UM = 2.0
