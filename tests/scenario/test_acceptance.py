@@ -64,7 +64,7 @@ def test_noise_under_a_cap_is_not_focused_on_with_a_picture_of_the_scene(seeds: 
             request=FocusRequest(reference=picture),
         )
         assert_invariants(story)
-        assert story.outcome is Outcome.TOO_FEW_EVENTS
+        assert story.outcome in {Outcome.TOO_FEW_EVENTS, Outcome.NO_CROSSING}
 
 
 NOTHING = [
