@@ -73,6 +73,7 @@ class Story:
     notes: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     commands: list[Command] = field(default_factory=list)
     lost_told: int = 0
+    camera_started_ns: int | None = None
     cancelled_ns: int | None = None
     misfortune_ns: int | None = None
 
@@ -320,6 +321,7 @@ class SpyCamera:
         return float(self._camera.min_latency_us)
 
     def start(self) -> None:
+        self._story.camera_started_ns = self._story.parts.clock.now_ns()
         self._camera.start()
 
     def read(self, timeout_s: float) -> CameraPacket | None:

@@ -31,7 +31,7 @@ from elpd.records import (
     Roi,
     StopMode,
 )
-from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
+from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
 from elpd.vision.choose import propose_roi
 from elpd.vision.reference import reference_from_frame
 
@@ -57,6 +57,12 @@ REST_LIMIT_MS = 1500.0
 
 APPROACH_MARGIN_UM = 2.0
 """How much further than the backlash the final approach begins."""
+
+RETURN_SHARE = 0.5
+"""The way back leads over the same ground as the way out, and beyond: half its events at the least."""
+
+LIT_SHARE = 0.5
+"""Half of the region's pixels answer when an aperture closes over a scene in the light; most do several times."""
 
 ROI_MARGIN_PX = 14
 """Pixels around the ROI that the sensor keeps on: filters need neighbours, motion needs room."""
@@ -251,6 +257,7 @@ class FocusCycle:
         self._watch = watch
         self._stage.listener = watch.rest
         self._stage.wait_ms(BIAS_SETTLE_MS)
+        self._stage.hear(safety.CAMERA_SILENCE_MS)
         watch.armed()
         return watch
 
@@ -300,6 +307,12 @@ class FocusCycle:
                 self._stage.listener, self._stage.interrupt = watch.keep, self._interrupt
                 return report
             if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
+                if report.verdict.outcome is Outcome.TOO_FEW_EVENTS and self._in_the_light(watch):
+                    raise _Ended(
+                        Outcome.LENS_DID_NOT_MOVE,
+                        "nothing changed while the lens should have moved, and yet the scene is in the light: the "
+                        "aperture shows it; check the coupling, and that the motor turns",
+                    )
                 raise self._rule(report.verdict)
             if self._reversals >= self._settings.max_reversals:
                 if report.end is SweepEnd.RULE:
@@ -315,6 +328,26 @@ class FocusCycle:
             self._reversals += 1
             reach_um = self._settings.max_travel_um + abs(self._here_um() - report.begun_um) + 2 * braking_um
             sign = -sign
+
+    def _in_the_light(self, watch: Watch) -> bool:
+        """Ask the aperture, if it made this cycle's picture: every lit pixel answers when it closes."""
+        aperture, stage = self._parts.aperture, self._stage
+        if aperture is None or self.map is None:
+            return False
+        stage.listener, stage.interrupt = watch.count, self._interrupt
+        stage.rest(REST_LIMIT_MS)
+        before, begun_ns = watch.events_in_cycle, stage.now_ns()
+        aperture.close()
+        try:
+            stage.wait_ms(aperture.opening_ms)
+            stage.hear(safety.CAMERA_SILENCE_MS)
+        finally:
+            aperture.open()
+        noise = watch.resting_rate_hz * (stage.now_ns() - begun_ns) / NS_PER_S
+        answers = watch.events_in_cycle - before - noise
+        stage.wait_ms(AFTER_FACTOR * aperture.opening_ms)
+        _, _, width, height = self._details["roi"]
+        return bool(answers > LIT_SHARE * width * height)
 
     def _judge(self, watch: Watch, passed: SweepReport) -> FocusEstimate:
         """Say where focus was, and refuse an answer that the evidence does not carry."""
@@ -362,7 +395,7 @@ class FocusCycle:
         sign = self._details["sweep_sign"]
         way_back_um = abs(self._stop_um - estimate.focus_um)
         expected = watch.events_within(estimate.focus_um, self._stop_um)
-        before = watch.events_in_cycle
+        before, begun_ns = watch.events_in_cycle, stage.now_ns()
         stage.listener = watch.count
         beyond_um = estimate.focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM)
         rest = None
@@ -378,13 +411,16 @@ class FocusCycle:
                 Outcome.LENS_DID_NOT_MOVE,
                 f"the lens rests {error_um:+.1f} um from where it was sent; check the motor current and the mechanics",
             )
-        seen = watch.events_in_cycle - before
+        stage.hear(safety.CAMERA_SILENCE_MS)
+        resting_hz = watch.resting_rate_hz
+        seen = watch.events_in_cycle - before - round(resting_hz * (stage.now_ns() - begun_ns) / NS_PER_S)
+        expected -= round(resting_hz * way_back_um / settings.speed_um_s)
         self._details["return_events"] = seen
-        if way_back_um > settings.depth_of_focus_um and seen < 0.1 * expected:
+        if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
             raise _Ended(
                 Outcome.LENS_DID_NOT_MOVE,
                 f"the controller says that the lens went back {way_back_um:.0f} um, but the scene did not change "
-                f"({seen} events, {expected} on the way out); check the coupling between motor and lens",
+                f"({seen} events above noise, {expected} on the way out); check the coupling between motor and lens",
             )
 
     # --- the pieces ---

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from elpd.errors import UsageError
 from elpd.events.stream import PacketDecoder
+from elpd.focus.safety import CAMERA_SILENCE_MS
 from elpd.ports import Biases, HardwareRoi
 from elpd.records import BiasSet
 from elpd.units import after_ms
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
 DARK_MS = 15.0
 """Biases settle and noise shows itself before the light comes."""
+
+LATE_LIMIT = 0.05
+"""Once the aperture is open the light stays as it is, and only noise makes first events."""
 
 AFTER_FACTOR = 1.5
 """Wait half as long again as the aperture says: dark pixels answer late."""
@@ -60,13 +64,24 @@ def expose(
     try:
         while stage.now_ns() < until:
             stage.read()
+        stage.hear(CAMERA_SILENCE_MS)
     finally:
         stage.listener = None
     if first.n_on == 0:
         return None, (False, "no pixel saw light while the aperture opened; is the lens cap on, the aperture stuck?")
     profile = {"profile": aperture.transmittance, "linear": linear, "iris": iris}[transmittance]
+    times = first.believed()
     try:
-        picture = temporal_image(first.believed(), profile)
+        picture = temporal_image(times, profile)
     except UsageError as error:
         return None, (False, str(error))
+    first_us = times.times_us[~(times.hot | times.unfired)]
+    open_until_us = picture.open_us - times.begin_us + 1000.0 * aperture.opening_ms
+    late = float((first_us > open_until_us).mean()) if first_us.size else 0.0
+    if late > LATE_LIMIT:
+        reason = (
+            f"{late:.0%} of the pixels first saw light later than the {aperture.opening_ms:.0f} ms that the aperture "
+            f"takes to open (limit {LATE_LIMIT:.0%}); is it slow or sticking? tell how long it takes"
+        )
+        return picture, (False, reason)
     return picture, quality(picture)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import sqrt
 from typing import TYPE_CHECKING
 
 from elpd.records import Outcome
@@ -21,6 +22,13 @@ CAMERA_SILENCE_MS = 50.0
 
 DARK_TRAVEL_DOF = 8.0
 """Eight depths of focus of travel without events: no scene does that except a dark one (lens cap)."""
+
+DARK_EVENTS = 20
+DARK_SIGMAS = 6.0
+"""A scene in the light stands this far above what noise alone makes, in events and in its standard deviations."""
+
+HEARD_MS = 5.0
+"""Nobody can call it dark while the camera says nothing at all: that is silence, and has a rule of its own."""
 
 STUCK_TRAVEL_DOF = 4.0
 """The commanded motion must show in the reports before the lens should have travelled this far."""
@@ -109,11 +117,13 @@ def _verdicts(now: Conditions) -> Iterator[Verdict]:
             "check that the motor is energised and free",
         )
     dark_um = DARK_TRAVEL_DOF * now.depth_of_focus_um
-    if now.travel_um > dark_um and now.events < 20 + 2 * now.resting_events and now.events < 200:
+    noise = now.resting_events + DARK_EVENTS + DARK_SIGMAS * sqrt(now.resting_events)
+    if now.travel_um > dark_um and now.events < noise and now.camera_silent_ms < HEARD_MS:
         yield Verdict(
             Action.GIVE_UP,
             Outcome.TOO_FEW_EVENTS,
-            f"only {now.events} events in the ROI over {now.travel_um:.0f} um of travel; "
+            f"only {now.events} events in the ROI over {now.travel_um:.0f} um of travel "
+            f"({now.resting_events:.0f} are noise); "
             "is it dark, is the lens cap on, is the ROI empty?",
         )
     if now.travel_um >= now.max_travel_um or now.way_to_limit_um <= 0:

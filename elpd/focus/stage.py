@@ -134,6 +134,25 @@ class Stage:
         way_s = abs(steps - start) / speed_sps + 2 * speed_sps / max(acceleration_sps2, 1.0)
         return self.rest(300.0 + 3000.0 * way_s, steps)
 
+    def hear(self, limit_ms: float) -> None:
+        """Read until the camera has spoken of the time after now: what follows may be judged by its silence.
+
+        Raises ``CameraError`` if it has not within *limit_ms*.
+        """
+        begun_ns = self.now_ns()
+        until = after_ms(begun_ns, limit_ms)
+        while self.now_ns() < until:
+            packet = self.read()
+            if packet is None:
+                continue
+            spoken_us = packet.complete_until_us
+            if spoken_us is None or self.sensor_clock.to_host(spoken_us) >= begun_ns:
+                return
+        raise CameraError(
+            f"camera: silent for {(self.now_ns() - self.last_packet_ns) / NS_PER_MS:.0f} ms (limit {limit_ms:.0f}); "
+            "check its cable and power"
+        )
+
     def newest_frame(self, limit_ms: float) -> Frame | None:
         """Wait for a frame that was exposed after now; ``None`` if none came."""
         begun_us = None

@@ -18,7 +18,6 @@ MOMENTS = [
     ("stop", 2.0),
     ("return", 5.0),
     ("return", 30.0),
-    ("verify", 2.0),
 ]
 
 
