@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from elpd.cli.common import json_option, print_json
+from elpd.cli.common import config_options, json_option, print_json
+from elpd.config import load
 from elpd.events.stream import EventStream, open_recording
 
 if TYPE_CHECKING:
@@ -33,9 +34,11 @@ ODDITIES = {
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
+@config_options
 @json_option
-def command(file: Path, *, as_json: bool) -> None:
+def command(file: Path, *, config_path: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Say what an event file holds: its events, times, triggers, digests and losses."""
+    load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
     reader = open_recording(file)
     try:
         summary = summarise(reader)

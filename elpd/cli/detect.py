@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from elpd.cli.common import json_option, parse_interval_us, parse_roi, print_json
+from elpd.cli.common import config_options, json_option, parse_interval_us, parse_roi, print_json
+from elpd.config import load
 from elpd.errors import FormatError, UsageError
 from elpd.record.journal import is_run
 from elpd.record.layouts import read_sweep
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 @click.option("--lens-path", "lens_path", type=click.Path(path_type=Path), help="CSV with rows t_us,position_um.")
 @click.option("--dof-um", type=float, help="Depth of focus.")
 @click.option("--method", type=click.Choice(["elpd", "paper"]), default="elpd", show_default=True)
+@config_options
 @json_option
 def command(
     path: Path,
@@ -54,9 +56,12 @@ def command(
     dof_um: float | None,
     method: str,
     *,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Find focus in a recorded sweep, using nothing later than the decision."""
+    load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
     aperture_us = parse_interval_us(aperture_text, "--aperture-us")
     roi = parse_roi(roi_text)
     ruler = _ruler(speed_um_s, lens_path)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from elpd.cli.common import json_option, print_json
+from elpd.cli.common import config_options, json_option, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -20,14 +20,17 @@ if TYPE_CHECKING:
 
 @click.command("replay")
 @click.argument("run", type=click.Path(path_type=Path))
+@config_options
 @json_option
-def command(*, run: Path, as_json: bool) -> int:
+def command(*, run: Path, config_path: Path | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Run the cycle recorded in the folder RUN again: exit 0 if it is identical byte for byte, 1 if not.
 
     RUN is a folder that `elpd focus` or `elpd demo` wrote. No device is touched and nothing is written.
     """
+    from elpd.config import load  # noqa: PLC0415
     from elpd.record.replay import load_run, replay_run  # noqa: PLC0415  (numpy and numba only now)
 
+    load(config_path, overrides)  # every command takes them; the cycle runs by the configuration it was recorded with
     recorded = load_run(run)
     report = replay_run(recorded, run_cycle)
     if as_json:

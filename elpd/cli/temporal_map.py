@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from elpd.cli.common import config_options, json_option, parse_interval_us, print_json
+from elpd.config import load
 from elpd.errors import FormatError, UsageError
 from elpd.events.registers import MAX_SIDE
 from elpd.events.stream import EventStream, open_recording
@@ -60,7 +61,7 @@ def command(
     The default profile is an iris: what lenses have, and what the method's authors assume. A wrong profile stretches
     the picture's contrast, but changes no order of brightness.
     """
-    del config_path, overrides  # accepted by every command; nothing here is configurable
+    load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
     aperture = parse_interval_us(interval, "--aperture-us")
     profile = read_transmittance(transmittance)
     gathered = _gather(file, aperture, _parse_size(size))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from elpd_drivers.lenses import grbl as grbl_driver
 from elpd_drivers.lenses import tic as tic_driver
+from elpd_drivers.lenses import tic_wire as wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lens_rigs import KINDS, SPEED_SPS, Rig, open_rig, rig
@@ -302,6 +303,14 @@ def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_conf
     with pytest.raises(LensError, match="home it again"):
         made.live(100)
     assert made.rotor == 3200.0
+
+
+def test_what_an_earlier_session_had_asked_for_does_not_confuse_the_next(kind: str) -> None:
+    made = rig(kind)
+    made.port.write(wire.encode(wire.GET_VARIABLE, bytes((0x22, 10))) if kind == "tic" else b"?")
+    made.open()
+    made.live(20)
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(3200, abs=1.7)
 
 
 def test_another_board_on_the_port_is_refused(kind: str) -> None:

@@ -151,7 +151,8 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
     for name in COMMANDS:
         told = elpd(name, "--help")
         assert told.code == 0
-        assert "--json" in told.out, name
+        for option in ("--json", "--config", "--set"):
+            assert option in told.out, (name, option)
 
 
 # --- what is refused ---------------------------------------------------------------------------------------------
@@ -190,6 +191,7 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
         (["detect", "recording.raw", "--roi", "0,0,0,0"], 2, "UsageError", "does not fit"),
         (["detect", "recording.raw", "--dof-um", "0"], 2, "UsageError", "positive"),
         (["temporal-map", "text.txt"], 2, "FormatError", "in no format"),
+        (["decode", "recording.raw", "--set", "focus.roy=1"], 2, "ConfigError", "unknown key"),
         (["replay", "text.txt"], 2, "FormatError", "run folder"),
         (["sim-board", "tmcl"], 2, "UsageError", "known are grbl, tic"),
     ],

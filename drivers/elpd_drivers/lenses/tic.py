@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from elpd.records import LensLimits, PositionEstimate
     from elpd.units import Steps
 
+IDENTIFICATIONS = 3
+"""How often to ask who is there, before what answers counts as no Tic."""
+
 
 @dataclass(frozen=True, slots=True)
 class TicSettings:
@@ -161,15 +164,7 @@ class TicLens:
 
     def connect(self) -> None:
         """Identify the board, halt it if it moves, set its ramps, and take its first report."""
-        self._port.read_available()
-        state = self._ask(0x00, 9)
-        step_mode = self._ask(0x49, 1)[0]
-        supply_mv = int.from_bytes(self._ask(0x33, 2), "little")
-        if state[0] not in wire.OPERATION_STATES or step_mode > 9 or not 2_000 <= supply_mv <= 60_000:
-            raise LensError(
-                f"lens port {self._settings.port or '(in memory)'}: what answered is not a Tic: operation state "
-                f"{state[0]}, step mode {step_mode}, supply {supply_mv} mV; check lens.board, baud and CRC settings"
-            )
+        self._identify()
         acceleration = long_word(round(self._limits.acceleration_sps2 * 100))
         setup = [(wire.SET_MAX_ACCELERATION, acceleration), (wire.SET_MAX_DECELERATION, acceleration)]
         setup.append((wire.SET_STARTING_SPEED, long_word(0)))
@@ -180,6 +175,29 @@ class TicLens:
         self._send(self._frame(wire.ENERGIZE) + self._frame(wire.EXIT_SAFE_START))
         self._await_report(after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms))
         self._referenced = not self._status & wire.UNCERTAIN
+
+    def _identify(self) -> None:
+        """See that a Tic answers; where what another session had asked for arrives first, ask again.
+
+        Raises ``LensError`` after the last attempt.
+        """
+        for attempts_left in reversed(range(IDENTIFICATIONS)):
+            self._port.read_available()
+            try:
+                state = self._ask(0x00, 9)
+                step_mode = self._ask(0x49, 1)[0]
+                supply_mv = int.from_bytes(self._ask(0x33, 2), "little")
+            except LensError:
+                if attempts_left == 0:
+                    raise
+                self._clock.sleep_until(after_ms(self._clock.now_ns(), self._settings.reply_ms))
+            else:
+                break
+        if state[0] not in wire.OPERATION_STATES or step_mode > 9 or not 2_000 <= supply_mv <= 60_000:
+            raise LensError(
+                f"lens port {self._settings.port or '(in memory)'}: what answered is not a Tic: operation state "
+                f"{state[0]}, step mode {step_mode}, supply {supply_mv} mV; check lens.board, baud and CRC settings"
+            )
 
     def home(self, deadline: HostNs) -> LensReport:
         """Run to the reverse limit switch; position 0 is where it lets go."""
