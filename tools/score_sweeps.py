@@ -47,7 +47,7 @@ def main() -> int:
 def score(case: Path, options: list[str]) -> dict[str, Any]:
     """Run the detector over one sweep and compare."""
     truth = json.loads((case / "truth.json").read_text())
-    more = list(options)
+    more = [first_frame(case) if one == "FIRST" else one for one in options]
     if truth.get("aperture_open_s") and "--aperture-us" not in more:
         more += ["--aperture-us", f"0,{round(truth['aperture_open_s'][0] * 1e6)}", "--frames", "none"]
     started = time.perf_counter()
@@ -76,6 +76,11 @@ def score(case: Path, options: list[str]) -> dict[str, Any]:
         "contributions": answer.get("contributions"),
         "error": answer.get("error"),
     }
+
+
+def first_frame(case: Path) -> str:
+    """Return the first frame of a sweep: what the word FIRST among the options stands for."""
+    return str(min(case.glob("davis_frames_50/*"), key=lambda path: int(path.stem)))
 
 
 def late(t_us: int | None, truth_us: int | None, um_per_us: float) -> float | None:

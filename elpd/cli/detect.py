@@ -12,8 +12,9 @@ import numpy as np
 from elpd.cli.common import json_option, parse_interval_us, parse_roi, print_json
 from elpd.errors import FormatError, UsageError
 from elpd.record.layouts import read_sweep
+from elpd.record.paper_sweep import detect_as_published
 from elpd.record.sweep_file import SweepSearch
-from elpd.records import Outcome
+from elpd.records import Geometry, Outcome
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
@@ -22,6 +23,7 @@ from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
     from elpd.record.sweep_file import Detection
+    from elpd.records import TemporalImage
 
 
 @click.command(name="detect")
@@ -56,7 +58,9 @@ def command(
     ruler = _ruler(speed_um_s, lens_path)
     if dof_um is not None and not dof_um > 0.0:
         raise UsageError(f"--dof-um must be positive; got {dof_um}")
-    sweep = read_sweep(path, frames=frames)
+    pixels = None if reference_path is None else load_image(reference_path)
+    size = None if pixels is None else Geometry(pixels.shape[1], pixels.shape[0])
+    sweep = read_sweep(path, frames=frames, size=size)
     for warning in sweep.warnings:
         print(f"elpd: {path}: {warning}", file=sys.stderr)
     roi = roi or sweep.roi
@@ -67,23 +71,36 @@ def command(
         )
     reference = None
     begin_us = None
+    picture = None
     if aperture_us is not None:
         first = FirstEventMap(sweep.geometry, *aperture_us)
         first.add(sweep.t_us, sweep.x, sweep.y, sweep.on)
         picture = temporal_image(first.believed(), read_transmittance(transmittance), SensorUs(aperture_us[0]))
         reference = reference_from_temporal_image(picture, roi)
         begin_us = aperture_us[1]
-    if reference_path is not None:
-        pixels = load_image(reference_path)
+    if pixels is not None:
         check_size(pixels.shape, sweep.geometry, str(reference_path))
         reference = reference_from_frame(pixels, roi)
+    if method == "paper":
+        found = detect_as_published(sweep, roi, pixels if picture is None else _as_published(picture), begin_us)
+        return _finish(found, as_json=as_json)
     search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)
-    found = search.run()
+    return _finish(search.run(), as_json=as_json)
+
+
+def _finish(found: Detection, *, as_json: bool) -> int:
     if as_json:
         print_json(_answer(found))
     else:
         _tell(found)
     return 0 if found.outcome is Outcome.FOCUSED else 1
+
+
+def _as_published(picture: TemporalImage) -> np.ndarray:
+    """Return a temporal map as its authors' code writes it: linear, stretched, to the power 1.5, read as 8 bit."""
+    linear = np.exp(picture.log_intensity.astype(np.float64))
+    stretched = (linear - linear.min()) / max(float(np.ptp(linear)), 1e-12)
+    return np.asarray(np.rint(255.0 * stretched**1.5), dtype=np.uint8)
 
 
 def _ruler(speed_um_s: float | None, lens_path: Path | None) -> Ruler:

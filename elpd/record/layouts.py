@@ -38,6 +38,7 @@ FRAME_FOLDERS = ("davis_frames_50", "frames", "davis_frames_20", "davis_frames_1
 
 _FRAME_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".pgm", ".bmp"}
 _REGION = re.compile(r"roi[^:=\n]*[:=]\s*\(?\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)", re.IGNORECASE)
+_BIN = re.compile(r"^\s*delta_t\s*[:=]\s*(\d+(?:\.\d+)?)", re.IGNORECASE | re.MULTILINE)
 _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (1280, 720))
 
 
@@ -58,6 +59,7 @@ class RecordedSweep:
     """A sweep on disk: events in time order, frames, and the region its makers chose.
 
     ``t_us`` ``int64``, ``x`` and ``y`` ``uint16``, ``on`` ``uint8`` (1 brighter, 0 darker), all of one length.
+    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it.
     """
 
     t_us: NDArray[np.int64]
@@ -67,47 +69,64 @@ class RecordedSweep:
     geometry: Geometry
     roi: Roi
     frames: tuple[FrameFile, ...] = ()
+    bin_us: int | None = None
     warnings: tuple[str, ...] = field(default=())
 
 
-def read_sweep(path: Path, *, frames: str | None = None) -> RecordedSweep:
+def read_sweep(path: Path, *, frames: str | None = None, size: Geometry | None = None) -> RecordedSweep:
     """Read a sweep from a folder, an ``.npz``, or an event file.
 
-    *frames* names a folder relative to *path*, or is ``"none"``; by default the authors' folders are tried.
+    *frames* names a folder relative to *path*, or is ``"none"``; by default the authors' folders are tried. *size* is
+    the sensor's, where the caller knows it and the file may not.
     Raises ``FormatError`` for what is not a sweep, ``UsageError`` for what does not exist.
     """
     if not path.exists():
         raise UsageError(f"{path}: no such file or folder")
     if path.is_dir():
-        return _read_folder(path, frames)
+        return _read_folder(path, frames, size)
     columns, geometry, warnings = _read_events(path)
     found = _frames_in(path.parent / frames) if frames not in (None, "none") else ()
-    return _assemble(path, columns, geometry, None, found, warnings)
+    return _assemble(path, columns, geometry or size, _Info(), found, warnings)
 
 
-def _read_folder(folder: Path, frames: str | None) -> RecordedSweep:
+def _read_folder(folder: Path, frames: str | None, size: Geometry | None) -> RecordedSweep:
     events = folder / EVENTS_NAME
     if not events.is_file():
         inside = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6]) or "nothing"
         raise FormatError(f"{folder}: no {EVENTS_NAME} in this folder (it holds {inside}); give a sweep's folder")
-    if frames == "none":
-        found: tuple[FrameFile, ...] = ()
-    elif frames is not None:
-        found = _frames_in(folder / frames)
-    else:
-        found = next((_frames_in(folder / name) for name in FRAME_FOLDERS if (folder / name).is_dir()), ())
+    usual = next((name for name in FRAME_FOLDERS if (folder / name).is_dir()), None)
+    chosen = usual if frames is None else frames
+    found = () if chosen in (None, "none") else _frames_in(folder / chosen)
     columns, geometry, warnings = _read_events(events)
-    return _assemble(folder, columns, geometry, _region(folder / INFO_NAME), found, warnings)
+    # The size of a frame is a fact of the camera; it may be known where the frames themselves are not to be used.
+    geometry = geometry or size or _frame_size(found or (_frames_in(folder / usual) if usual else ()))
+    return _assemble(folder, columns, geometry, _read_info(folder / INFO_NAME), found, warnings)
 
 
-def _region(info: Path) -> tuple[int, int, int, int] | None:
-    """Return (y1, y2, x1, x2) of ``info.txt``, and nothing else of it."""
+def _frame_size(frames: Sequence[FrameFile]) -> Geometry | None:
+    if not frames:
+        return None
+    height, width = frames[0].load().shape[:2]
+    return Geometry(width, height)
+
+
+@dataclass(frozen=True, slots=True)
+class _Info:
+    """What is taken from ``info.txt``, and nothing else of it: (y1, y2, x1, x2), and the authors' bin."""
+
+    region: tuple[int, int, int, int] | None = None
+    bin_us: int | None = None
+
+
+def _read_info(info: Path) -> _Info:
     try:
         text = info.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return None
-    match = _REGION.search(text)
-    return None if match is None else tuple(int(part) for part in match.groups())  # type: ignore[return-value]
+        return _Info()
+    region = _REGION.search(text)
+    width = _BIN.search(text)
+    y1, y2, x1, x2 = (int(part) for part in region.groups()) if region else (0, 0, 0, 0)
+    return _Info((y1, y2, x1, x2) if region else None, round(float(width.group(1))) if width else None)
 
 
 def _frames_in(folder: Path) -> tuple[FrameFile, ...]:
@@ -200,11 +219,12 @@ def _assemble(
     path: Path,
     columns: dict[str, NDArray[Any]],
     geometry: Geometry | None,
-    region: tuple[int, int, int, int] | None,
+    info: _Info,
     frames: Sequence[FrameFile],
     warnings: Sequence[str],
 ) -> RecordedSweep:
     notes = list(warnings)
+    region = info.region
     sizes = {name: column.size for name, column in columns.items()}
     if not columns or not all(sizes.values()):
         raise FormatError(f"{path}: no events in it; nothing can be focused from an empty recording")
@@ -217,7 +237,7 @@ def _assemble(
     y = columns["y"].astype(np.int64)
     on = (columns["p"] > 0).astype(np.uint8)
     if geometry is None:
-        geometry = _size_of(frames, x, y, region)
+        geometry = _frame_size(frames) or _size_of(x, y, region)
     outside = (x < 0) | (y < 0) | (x >= geometry.width) | (y >= geometry.height)
     if outside.any():
         raise FormatError(
@@ -236,23 +256,15 @@ def _assemble(
         else:
             notes.append(f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor; all of it used")
     return RecordedSweep(
-        t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), tuple(notes)
+        t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), info.bin_us, tuple(notes)
     )
 
 
-def _size_of(
-    frames: Sequence[FrameFile],
-    x: NDArray[np.int64],
-    y: NDArray[np.int64],
-    region: tuple[int, int, int, int] | None,
-) -> Geometry:
-    """Return the sensor's size: that of a frame, or the smallest known sensor that holds events and region.
+def _size_of(x: NDArray[np.int64], y: NDArray[np.int64], region: tuple[int, int, int, int] | None) -> Geometry:
+    """Return the smallest known sensor that holds the events and the region.
 
     Not simply the events' extent: it would depend on how long the recording is, and so would the answer.
     """
-    if frames:
-        height, width = frames[0].load().shape[:2]
-        return Geometry(width, height)
     right = max(int(x.max()) + 1, region[3] if region else 0)
     bottom = max(int(y.max()) + 1, region[1] if region else 0)
     for width, height in _SENSOR_SIZES:

@@ -17,11 +17,12 @@ from elpd.records import Direction, FocusEstimate, Outcome
 from elpd.vision.crossing import (
     FLANK,
     ROI_MARGIN_PX,
-    SYSTEMATIC_FRAMES,
+    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
     EventStretch,
     Witness,
     ask_events,
+    frame_witness,
     fuse,
 )
 from elpd.vision.detector import Detector
@@ -42,6 +43,9 @@ MIN_EVENTS = 1_000
 
 _RISE_WITHOUT_FRAMES = 0.30
 _RETRY_EVERY = 4
+
+_PATIENT_DROP = 0.2
+"""Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +204,10 @@ class SweepSearch:
             if not self._frames.passed or self._frames.times_us[-1] != now_us:
                 return None
             vertex = self._frames.vertex()
-            if vertex is None:
+            if vertex is None or (self._detector.likely_crossing_us is None and self._frames.drop < _PATIENT_DROP):
                 return None
-            sigma = float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * vertex.width))
-            witnesses.append(Witness("frames", vertex.at, sigma))
-            limit = vertex.width / WIDTHS_PER_DEPTH_OF_FOCUS
+            spacing = float(np.median(np.abs(np.diff(self._frames.positions))))
+            witnesses.append(frame_witness(vertex, spacing))
         elif not self._image_peak_passed():
             return None
         self._attempts_until = self._detector.samples + _RETRY_EVERY
@@ -255,7 +258,8 @@ class SweepSearch:
             self._brightness(),
         )
         self._width = said.vertex.width if said.vertex is not None else None
-        return [replace(one, at=sign * one.at) for one in said.witnesses()]
+        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
+        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)]
 
     def _brightness(self) -> NDArray[np.float32] | None:
         """Return the reference's brightness over the cut-out."""
@@ -281,12 +285,15 @@ class SweepSearch:
                 "focus; sweep more slowly, or give frames or a larger region",
             )
             return None
+        if found.direction is Direction.UNKNOWN:
+            # Without a picture the direction is only known once focus has gone by.
+            found = replace(found, direction=Direction.APPROACHING, direction_decided_us=now_us)
         names = ", ".join(f"{name} {weight:.0%}" for name, _, _, weight in estimate.contributions)
         return replace(found, reason=f"focus was passed; measured by {names}")
 
     def _report(self, outcome: Outcome, reason: str, estimate: FocusEstimate | None, now_us: int | None) -> Detection:
         detector = self._detector
-        direction, decided_us = self._direction()
+        direction, direction_us = self._direction()
         focus_us = sigma_us = None
         if estimate is not None and now_us is not None:
             focus = self._ruler.time_of(estimate.focus_um, now_us)
@@ -297,7 +304,7 @@ class SweepSearch:
             outcome,
             reason,
             direction,
-            decided_us,
+            direction_us,
             crossing_us,
             focus_us,
             sigma_us,

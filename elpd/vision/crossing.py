@@ -38,11 +38,19 @@ WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
 SYSTEMATIC_FRAMES = 0.012
-SYSTEMATIC_VERTEX = 0.05
-SYSTEMATIC_PAIRS = 0.03
+SYSTEMATIC_VERTEX = 0.06
+SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
-SYSTEMATIC_CROSSING = 0.25
+LAG_UNEXPLAINED = 0.5
+"""How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
+
+UNMEASURED_LAG_US = 1_500.0
+"""What a photoreceptor's lag may be when nothing tells: tens of microseconds in sunlight, milliseconds in the dark."""
+
+COARSE_FRAMES = 0.25
+"""Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
+
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
 
@@ -59,11 +67,21 @@ _MIN_PAIRS = 30
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """One estimator's answer, on the caller's ruler."""
+    """One estimator's answer, on the caller's ruler.
+
+    ``sigma`` is its own standard error; ``shared`` one that all witnesses of its kind have in common, with one sign:
+    what is not known of the photoreceptors' lag makes every event late.
+    """
 
     name: str
     at: float
     sigma: float
+    shared: float = 0.0
+
+    @property
+    def total_sigma(self) -> float:
+        """Both errors together."""
+        return float(np.hypot(self.sigma, self.shared))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +110,6 @@ class Lag:
     sigma: float = 0.0
     typical: float = 0.0
 
-    @property
-    def known(self) -> bool:
-        """Whether it was measured at all."""
-        return self.sigma > 0.0
-
-
 @dataclass(frozen=True, slots=True)
 class EventWitnesses:
     """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
@@ -106,21 +118,25 @@ class EventWitnesses:
     pairs: Mode | None
     lag: Lag
 
-    def witnesses(self) -> list[Witness]:
-        """Return those that are to be believed, with systematic errors included."""
+    def witnesses(self, unmeasured_lag: float) -> list[Witness]:
+        """Return those that are to be believed, with systematic errors included.
+
+        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured.
+        """
         found = []
         if self.vertex is None:
             return found
         width = self.vertex.width
-        unknown = SYSTEMATIC_VERTEX * width
-        if self.lag.known:
-            unknown = float(np.hypot(SYSTEMATIC_PAIRS * width, self.lag.sigma * self.lag.typical))
-        found.append(Witness("vertex", self.vertex.at, float(np.hypot(self.vertex.sigma, unknown))))
+        shared = unmeasured_lag
+        if self.lag.sigma > 0.0:
+            shared = self.lag.typical * float(np.hypot(LAG_UNEXPLAINED * self.lag.at, self.lag.sigma))
+        sigma = float(np.hypot(self.vertex.sigma, SYSTEMATIC_VERTEX * width))
+        found.append(Witness("vertex", self.vertex.at, sigma, shared))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
             # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
             stray = max(0.0, _STATIC_SHARE - self.pairs.share)
             sigma = float(np.hypot(self.pairs.sigma, (SYSTEMATIC_PAIRS + stray) * width))
-            found.append(Witness("pairs", self.pairs.at, sigma))
+            found.append(Witness("pairs", self.pairs.at, sigma, shared))
         return found
 
 
@@ -171,21 +187,32 @@ def _vertex(
     return vertex, level_at_peak
 
 
+def frame_witness(vertex: Vertex, spacing: float) -> Witness:
+    """Return what frames say, taken every *spacing* along the sweep."""
+    coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.width))
+    return Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * coarseness * vertex.width)))
+
+
 def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
-    """Return the weighted mean; its error grows where the witnesses disagree beyond theirs (Birge's ratio)."""
+    """Return the least-squares mean under the witnesses' joint covariance.
+
+    Its error grows where they disagree beyond theirs (Birge's ratio).
+    """
     if not witnesses:
         return None
     at = np.array([one.at for one in witnesses])
-    weight = np.array([1.0 / one.sigma**2 for one in witnesses])
-    share = weight / weight.sum()
+    shared = np.array([one.shared for one in witnesses])
+    covariance = np.diag([one.sigma**2 for one in witnesses]) + np.outer(shared, shared)
+    precision = np.linalg.inv(covariance)
+    share = precision.sum(axis=0) / precision.sum()
     focus = float(share @ at)
-    sigma = float(1.0 / np.sqrt(weight.sum()))
+    sigma = float(1.0 / np.sqrt(precision.sum()))
     if at.size > 1:
-        chi_square = float(weight @ (at - focus) ** 2) / (at.size - 1)
+        chi_square = float((at - focus) @ precision @ (at - focus)) / (at.size - 1)
         sigma *= float(np.sqrt(max(1.0, chi_square)))
-    main = witnesses[int(np.argmax(weight))].name
+    main = witnesses[int(np.argmax(share))].name
     contributions = tuple(
-        (one.name, one.at, one.sigma, float(part)) for one, part in zip(witnesses, share, strict=True)
+        (one.name, one.at, one.total_sigma, float(part)) for one, part in zip(witnesses, share, strict=True)
     )
     return FocusEstimate(focus, sigma, "pairs" if main == "pairs" else "crossing", contributions)
 

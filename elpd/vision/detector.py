@@ -77,6 +77,7 @@ class Detector:
         self._high_us = 0
         self._energy_since_high = self._energy_since_low = 0.0
         self._events_since_high = self._events_since_low = 0
+        self._at_high = (0.0, 0.0)
         self._foot = 0.0
         self._previous: tuple[float, float] | None = None
         self._differences: deque[tuple[float, float]] = deque(maxlen=_DISPERSION_WINDOWS)
@@ -127,10 +128,15 @@ class Detector:
 
     def _follow(self, sample: ElpSample) -> None:
         count = sample.n_on + sample.n_off
+        centre_us = 0.5 * (sample.begin_us + sample.end_us)
+        rate = sample.elp / max(1, sample.end_us - sample.begin_us)
         if self._total >= self._high or self._high_us == 0:
             self._high, self._high_us = max(self._total, self._high), sample.end_us
+            self._at_high = (centre_us, rate)
             self._energy_since_high, self._events_since_high = 0.0, 0
         else:
+            if self._events_since_high == 0 and rate < 0.0:
+                self._high_us = self._zero_between((centre_us, rate))
             self._energy_since_high += sample.energy
             self._events_since_high += count
         if self._total <= self._low:
@@ -139,6 +145,11 @@ class Detector:
         else:
             self._energy_since_low += sample.energy
             self._events_since_low += count
+
+    def _zero_between(self, after: tuple[float, float]) -> int:
+        """Return where the line through the rates of the last positive and the first negative window is zero."""
+        (t0, rate0), (t1, rate1) = self._at_high, after
+        return round(t0 + (t1 - t0) * rate0 / (rate0 - rate1)) if rate0 > 0.0 else self._high_us
 
     def _judge(self, sample: ElpSample) -> None:
         rally = self._total - self._low
@@ -152,6 +163,7 @@ class Detector:
             self._turn(Direction.APPROACHING, sample, self.approach_score)
             self._foot = self._low
             self._high, self._high_us = self._total, sample.end_us
+            self._at_high = (0.5 * (sample.begin_us + sample.end_us), sample.elp / max(1, sample.end_us - sample.begin_us))
             self._energy_since_high, self._events_since_high = 0.0, 0
         elif (
             self.direction is not Direction.RECEDING

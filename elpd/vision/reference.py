@@ -4,7 +4,8 @@ The Event Laplacian Product is linear, so all that an event needs to know about 
 its pixel. The paper weights by the Laplacian of the newest frame. Here the weight is a Laplacian of Gaussian, divided
 by the local brightness, because events answer to log intensity and ``d(log I)/dt ∝ ∇²I / I`` (facts of the field: a
 plain Laplacian lets the bright corner of a picture vote alone). Its scale is the finest at which the picture stands out
-of its own noise: a frame blurred tenfold has nothing but noise in a 3x3 Laplacian.
+of its own noise and still has its share of structure. A frame blurred tenfold has neither in a 3x3 Laplacian; worse, a
+lens far out of focus *inverts* fine contrast (its transfer function has negative lobes), which points the wrong way.
 
 Weights have zero mean inside the ROI, so that an imbalance between ON and OFF noise cancels, are clipped at a high
 percentile, so that no single pixel decides, are zero where the picture is invalid, and are scaled to ``int16``, so that
@@ -35,6 +36,7 @@ FULL_SCALE = 4096
 _SCALES_PX = (1.0, 1.5, 2.2, 3.3, 5.0)
 _CLIP_PERCENTILE = 99.0
 _SIGNAL_TO_NOISE = 4.0
+_SHARE_OF_STRUCTURE = 0.5
 _TEXTURE_SIGMAS = 6.0
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 
@@ -127,19 +129,18 @@ def _build(
     noise_variance = max(_white_noise_variance(filled[inside]), step_variance)
 
     texture = 0.0
-    chosen = _SCALES_PX[-1]
-    response = np.zeros_like(filled)
-    settled = False
-    for scale_px in _SCALES_PX:
-        filtered = _laplacian_of_gaussian(filled, scale_px)
-        energy = float(np.mean(np.square(filtered[usable], dtype=np.float64))) if usable.any() else 0.0
+    responses = [_laplacian_of_gaussian(filled, scale_px) for scale_px in _SCALES_PX]
+    structure = np.zeros(len(_SCALES_PX))
+    for k, scale_px in enumerate(_SCALES_PX):
+        energy = float(np.mean(np.square(responses[k][usable], dtype=np.float64))) if usable.any() else 0.0
         floor = noise_variance * _noise_gain(scale_px) + 1e-12
         excess = energy / floor - 1.0
         independent = max(1.0, usable.sum() / (4.0 * np.pi * scale_px**2))
         texture = max(texture, excess * np.sqrt(independent / 2.0))
-        if not settled:
-            chosen, response = scale_px, filtered
-            settled = excess > _SIGNAL_TO_NOISE
+        # Scale-normalised, a sharp natural picture has equal energy at all scales; a blurred one lacks the fine ones.
+        structure[k] = scale_px**4 * (energy - floor) if excess > _SIGNAL_TO_NOISE else 0.0
+    best = int(np.argmax(structure >= _SHARE_OF_STRUCTURE * structure.max())) if structure.max() > 0.0 else -1
+    chosen, response = _SCALES_PX[best], responses[best]
     brightness = _relative_brightness(filled, ground, usable)
     if ground is not None:
         response = response / (cv2.GaussianBlur(filled, (0, 0), 2.0 * chosen) + np.float32(ground))
