@@ -2,20 +2,22 @@
 
 **The published text gives the idea but not the formula, and no code is public; the evaluation function here is ours.**
 A pixel that brightens at t0-τ darkens at t0+τ, so the ON rate before focus mirrors the OFF rate after it and the other
-way round. For each centre c = s/2 of the grid, half bins included,
+way round. For each centre c = s/2 of the grid, half bins included, the pairs i + j = s within reach are compared and
+their coefficient of correlation, of P_i with g·N_j and of g·N_i with P_j together, is highest at the centre of
+symmetry. A parabola through it refines the answer.
 
-    D(s) = Σ |P_i - g·N_j| / Σ (P_i + g·N_j)   over i + j = s,
+What a fair peer needs and a plain sum of differences lacks: the gain g = ΣP/ΣN takes out unequal ON and OFF
+thresholds, and a correlation does not care for the noise floor of either side nor for a lens whose spot is not the same
+before and behind focus. On the benchmark's development seed (42 sweeps) the normalised sum of differences over the
+whole stack had errors up to 185 um where nothing moved; this form has 21 at worst and the smallest means.
 
-is least at the centre of symmetry; a parabola through D refines it. Two things that a fair peer needs and a plain
-version lacks: the gain g = ΣP/ΣN takes out unequal ON and OFF thresholds, and each polarity's noise floor, its lowest
-smoothed rate, is subtracted first (without them the plain version is off by 15-50 ms, ``algorithms.md`` §3).
-
-Known to work on anything whose blur is symmetric about focus, strobe light included; late by half the threshold
-hysteresis, and wrong where scene motion makes the events. It needs both sides of focus.
+Known to work on anything whose blur is symmetric about focus, strobe light included. It is late by the thresholds'
+hysteresis (about 10 um there, 4.5 in the paper), and wrong where scene motion makes the events. It needs both sides.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,44 +31,58 @@ if TYPE_CHECKING:
 
 BIN_US = 2_000
 SMOOTHING_BINS = 2.0
-FLOOR_BINS = 5.0
+REACH = 0.12
+"""How far to either side of a centre rates are compared, as a share of the stack."""
 
 
 def estimate(stack: FocusStack) -> Estimate:
     """Return the centre of symmetry of the two polarity rates, searched in the middle half of the stack."""
-    rates = polarity_rates(stack, BIN_US)
-    on, off = _above_floor(rates.on), _above_floor(rates.off)
-    if not (on.any() and off.any()):
-        return no_answer("one polarity never rises above its noise floor")
-    gain = float(on.sum() / off.sum())
+    rates = polarity_rates(stack, min(BIN_US, max(stack.duration_us // 100, 1)))
+    if not (rates.on.any() and rates.off.any()):
+        return no_answer("only one polarity in the region")
+    gain = float(rates.on.sum() / rates.off.sum())
+    on = np.ascontiguousarray(smooth(rates.on, SMOOTHING_BINS))
+    off = np.ascontiguousarray(gain * smooth(rates.off, SMOOTHING_BINS))
     bins = on.size
-    asymmetry = np.ones(2 * bins - 1, dtype=np.float64)
-    mirror_asymmetry(on, np.ascontiguousarray(gain * off), asymmetry)
+    similarity = np.full(2 * bins - 1, -1.0)
+    mirror_similarity(on, off, max(round(REACH * bins), 2), similarity)
     low, high = bins // 2, 2 * bins - 1 - bins // 2
-    if high - low < 3:
-        return no_answer("the stack is too short to have a middle half", bins=bins)
-    best = low + int(np.argmin(asymmetry[low:high]))
-    focus_us = rates.time_at(0.5 * vertex(asymmetry, best))
-    return Estimate(focus_us, float(stack.end_us), {"gain": gain, "asymmetry": float(asymmetry[best])})
+    best = low + int(np.argmax(similarity[low:high]))
+    if similarity[best] <= 0.0:
+        return no_answer("the polarity rates have no centre of symmetry", similarity=float(similarity[best]))
+    focus_us = rates.time_at(0.5 * vertex(similarity, best))
+    return Estimate(focus_us, float(stack.end_us), {"gain": gain, "similarity": float(similarity[best])})
 
 
-def _above_floor(counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return smoothed counts less their noise floor, never below zero."""
-    floor = float(smooth(counts, FLOOR_BINS).min())
-    return np.ascontiguousarray(np.maximum(smooth(counts, SMOOTHING_BINS) - floor, 0.0))
+@kernel("void(float64[::1], float64[::1], int64, float64[::1])")
+def mirror_similarity(
+    on: NDArray[np.float64], off: NDArray[np.float64], reach: int, similarity: NDArray[np.float64]
+) -> None:
+    """Write the correlation of the rates with their mirror image for every sum of indices ``s`` (2n-1,).
 
-
-@kernel("void(float64[::1], float64[::1], float64[::1])")
-def mirror_asymmetry(on: NDArray[np.float64], off: NDArray[np.float64], asymmetry: NDArray[np.float64]) -> None:
-    """Write D(s) for every sum of indices ``s`` into *asymmetry* (2n-1,); 1 where nothing overlaps.
-
-    *on* and *off* are (n,) rates, *off* already multiplied by the gain.
+    *on* and *off* are (n,) rates, *off* already multiplied by the gain. Up to *reach* pairs i < j, i + j = s, are
+    taken, each twice: (on_i, off_j) and (off_i, on_j). -1 where there are fewer than two pairs or nothing varies.
     """
     bins = on.size
     for s in range(2 * bins - 1):
-        difference = 0.0
-        total = 0.0
-        for i in range(max(0, s - bins + 1), min(s, bins - 1) + 1):
-            difference += abs(on[i] - off[s - i])
-            total += on[i] + off[s - i]
-        asymmetry[s] = difference / total if total > 0.0 else 1.0
+        above = s // 2 + 1
+        pairs = min(reach, bins - above, (s + 1) // 2)
+        similarity[s] = -1.0
+        if pairs < 2:
+            continue
+        sum_a = sum_b = 0.0
+        for k in range(pairs):
+            i, j = (s + 1) // 2 - 1 - k, above + k
+            sum_a += on[i] + off[i]
+            sum_b += off[j] + on[j]
+        mean_a, mean_b = sum_a / (2 * pairs), sum_b / (2 * pairs)
+        aa = bb = ab = 0.0
+        for k in range(pairs):
+            i, j = (s + 1) // 2 - 1 - k, above + k
+            a, b = on[i] - mean_a, off[j] - mean_b
+            c, d = off[i] - mean_a, on[j] - mean_b
+            aa += a * a + c * c
+            bb += b * b + d * d
+            ab += a * b + c * d
+        if aa > 0.0 and bb > 0.0:
+            similarity[s] = ab / math.sqrt(aa * bb)

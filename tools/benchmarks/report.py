@@ -1,0 +1,214 @@
+"""The report: one HTML file that holds its tables, plots and words, and refers to nothing.
+
+It says first what the numbers are and are not: which methods saw the future, which were allowed a tuned offset, and
+what a mean leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.cases import DEPTH_OF_FOCUS_UM, SETS, SPEED_UM_S, START_UM
+from benchmarks.methods import OURS, all_methods
+from benchmarks.plots import Plot, Series, draw
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from benchmarks.methods import Row
+    from benchmarks.scoring import Score
+
+PLOTTED = (
+    (OURS, "50"),
+    (OURS, "1"),
+    (OURS, "-"),
+    ("elp-syn", "50"),
+    ("elp-syn-1fps", "1"),
+    ("pbf", "-"),
+    ("egs", "-"),
+    ("esva", "-"),
+)
+"""What error distributions show; eight lines can still be told apart."""
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; color: #111 }
+table { border-collapse: collapse; margin: .6rem 0 1.6rem; font-size: 13px; font-variant-numeric: tabular-nums }
+th, td { border-bottom: 1px solid #ddd; padding: .2rem .55rem; text-align: right; white-space: nowrap }
+th { background: #f4f4f4; position: sticky; top: 0 } td.word, th.word { text-align: left }
+tr.ours td { background: #eef6ff } td.bad { color: #b00020; font-weight: 600 }
+.plots { display: flex; flex-wrap: wrap; gap: 1rem } .scroll { overflow-x: auto }
+svg text { font-family: system-ui, sans-serif; font-size: 13px } svg .small { font-size: 11px; fill: #333 }
+svg .title { font-weight: 600 } svg .frame { fill: none; stroke: #888 } svg .grid { stroke: #e8e8e8 }
+svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; font-weight: 600; margin: .8rem 0 }
+"""
+
+WORDS = f"""
+<p>One sweep per case, {START_UM:g} to {-START_UM:g} um in one second ({SPEED_UM_S / 1e3:g} um/ms), depth of focus
+{DEPTH_OF_FOCUS_UM:g} um; truth is the plane of least RMS spot radius. <b>Error</b> is estimate less truth. A mean
+over answered cases says nothing about the others: <b>missed</b> counts cases without an answer, <b>outside</b>
+answers more than one depth of focus off, <b>early</b> decisions more than that before focus. <b>Decided</b> is how
+far past focus the lens was when the answer could first be given as it stands, the median: a method that looks at
+the whole stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the
+start of the sweep until the lens could be back at the estimate, without braking. <b>CPU</b> is the median processor
+time of the method for the whole sweep, in this implementation.</p>
+<p><b>Paper</b> is the paper's MAE on its own 84 cases, for ELP an estimate made in hindsight with a built-in
+offset; <b>rerun</b> what a later paper's authors found when they ran it. The cases here follow the paper's text;
+its pictures, lens and noise are not public, so the columns stand beside each other and are not the same
+measurement.</p>
+"""
+
+
+def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settings: dict[str, Any]) -> None:
+    """Write the report to *path*."""
+    told = ", ".join(
+        f"{key} {value if not isinstance(value, list) else ' '.join(value)}" for key, value in settings.items()
+    )
+    body = [f"<h1>Autofocus benchmark</h1><p>{escape(told)}</p>", WORDS]
+    for set_name in dict.fromkeys(score.set_name for score in table):
+        chosen = SETS[set_name]
+        body.append(f"<h2>Set {escape(set_name)}</h2><p>Sensor preset {chosen.retina}, motion in units of ")
+        body.append(f"{chosen.motion_px:.3g} sensor pixels.</p>")
+        own_rows = [row for row in rows if row.set_name == set_name]
+        own_scores = [score for score in table if score.set_name == set_name]
+        motions = list(dict.fromkeys(score.motion for score in own_scores))
+        for motion in motions:
+            body.append(f"<h3>{escape(motion)}</h3>")
+            body.append(_score_table([score for score in own_scores if score.motion == motion]))
+        body.append("<h3>How errors are distributed</h3><div class='plots'>")
+        body.extend(_errors([row for row in own_rows if row.motion == motion], motion) for motion in motions)
+        body.append(_calibration(own_rows))
+        body.append("</div><h3>ELP as published, filtered, over the sweep</h3><div class='plots'>")
+        body.extend(_curves(own_rows, motions))
+        body.append("</div>")
+        body.append(_case_table(own_rows))
+    page = (
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Autofocus benchmark</title>"
+        f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _score_table(table: Sequence[Score]) -> str:
+    methods = all_methods()
+    heads = (
+        ("method", "fps", "sees"),
+        ("cases", "MAE um", "bias", "worst", "missed", "outside", "early", "decided um", "to focus ms", "CPU ms"),
+        ("rms err/σ", "paper MAE", "rerun MAE"),
+    )
+    words = "".join(f"<th class='word'>{head}</th>" for head in heads[0])
+    numbers = "".join(f"<th>{head}</th>" for head in (*heads[1], *heads[2]))
+    lines = [f"<div class='scroll'><table><tr>{words}{numbers}</tr>"]
+    for score in table:
+        method = methods[score.method]
+        bad = [" class='bad'" if count else "" for count in (score.missed, score.outside, score.early)]
+        lines.append(f"<tr{' class=ours' if score.method == OURS else ''}>")
+        lines.append(f"<td class='word'>{escape(method.title)}</td><td class='word'>{score.rate}</td>")
+        lines.append(f"<td class='word'>{escape(method.sees)}</td><td>{score.cases}</td>")
+        lines.append(f"<td><b>{_number(score.mae_um)}</b></td><td>{_number(score.bias_um, signed=True)}</td>")
+        lines.append(
+            f"<td>{_number(score.worst_um)}</td><td{bad[0]}>{score.missed}</td><td{bad[1]}>{score.outside}</td>"
+        )
+        lines.append(f"<td{bad[2]}>{score.early}</td><td>{_number(score.decided_um, signed=True)}</td>")
+        lines.append(
+            f"<td>{_number(score.focusing_ms)}</td><td>{_number(score.cpu_ms)}</td><td>{_number(score.spread)}</td>"
+        )
+        lines.append(f"<td>{_number(score.published_um)}</td><td>{_number(score.rerun_um)}</td></tr>")
+    return "".join(lines) + "</table></div>"
+
+
+def _case_table(rows: Sequence[Row]) -> str:
+    """Return every case's errors: a line per case, a column per method and frame rate."""
+    pairs = list(dict.fromkeys((row.method, row.rate) for row in rows))
+    by_case: dict[str, dict[tuple[str, str], Row]] = {}
+    for row in rows:
+        by_case.setdefault(row.case, {})[row.method, row.rate] = row
+    heads = "".join(f"<th>{escape(method)}<br>{rate}</th>" for method, rate in pairs)
+    lines = [
+        "<details><summary>Every case: error in um, “/” where there was no answer (its reason on hover)</summary>",
+        f"<div class='scroll'><table><tr><th class='word'>case</th><th>events</th>{heads}</tr>",
+    ]
+    for case, found in by_case.items():
+        events = next(iter(found.values())).events
+        lines.append(f"<tr><td class='word'>{escape(case)}</td><td>{events}</td>")
+        for pair in pairs:
+            row = found[pair]
+            if row.error_um is None:
+                lines.append(f"<td title='{escape(row.reason, quote=True)}'>/</td>")
+            else:
+                bad = " class='bad'" if abs(row.error_um) > DEPTH_OF_FOCUS_UM else ""
+                lines.append(f"<td{bad}>{row.error_um:+.2f}</td>")
+        lines.append("</tr>")
+    return "".join(lines) + "</table></div></details>"
+
+
+def _errors(rows: Sequence[Row], motion: str) -> str:
+    """Draw the share of *all* cases with an error below x: lines that do not reach one have misses."""
+    series = []
+    for method, rate in PLOTTED:
+        own = [row for row in rows if (row.method, row.rate) == (method, rate)]
+        errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
+        if errors:
+            shares = [(k + 1) / len(own) for k in range(len(errors))]
+            series.append(Series(_label(method, rate), errors, shares))
+    marks = ((DEPTH_OF_FOCUS_UM, "depth of focus"),)
+    return draw(
+        Plot(
+            f"{motion}: share of cases below an error", "|error| um", "share of all cases", series,
+            log_x=True, x_range=(0.02, 400.0), y_range=(0.0, 1.0), marks=marks,
+        )
+    )  # fmt: skip
+
+
+def _calibration(rows: Sequence[Row]) -> str:
+    """Draw |error|/sigma of our own answers against what a normal error would give."""
+    grid = np.linspace(0.05, 5.0, 100)
+    normal = [math.erf(x / math.sqrt(2.0)) for x in grid]
+    series = [Series("normal", grid.tolist(), normal)]
+    for rate in all_methods()[OURS].rates:
+        own = [row for row in rows if (row.method, row.rate) == (OURS, rate)]
+        ratios = np.array(
+            [abs(row.error_um) / row.sigma_um for row in own if row.error_um is not None and row.sigma_um]
+        )
+        if ratios.size:
+            shares = [(ratios <= x).mean() for x in grid]
+            series.append(Series(_label(OURS, rate), grid.tolist(), shares))
+    title = "Is the claimed standard error true?"
+    return draw(Plot(title, "|error| / claimed sigma", "share of answers", series, y_range=(0.0, 1.0)))
+
+
+def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
+    """Draw the published ELP of the first case of each motion, at 50 fps and with the one future frame."""
+    plots = []
+    for motion in motions:
+        first = next((row.case for row in rows if row.motion == motion and "curve" in row.details), None)
+        series, marks = [], [(0.0, "truth")]
+        for row in rows:
+            if row.case != first or "curve" not in row.details:
+                continue
+            curve = row.details["curve"]
+            series.append(
+                Series(
+                    _label(row.method, row.rate),
+                    [START_UM + t_us * SPEED_UM_S / 1e6 for t_us in curve["t_us"]],
+                    curve["elp"],
+                )
+            )
+            if row.decided_um is not None:
+                marks.append((row.decided_um, f"decided, {_label(row.method, row.rate)}"))
+        plots.append(draw(Plot(str(first), "lens position um", "ELP per event", series, marks=marks)))
+    return plots
+
+
+def _label(method: str, rate: str) -> str:
+    return method if rate == "-" and method != OURS else f"{method}, {'no frames' if rate == '-' else rate + ' fps'}"
+
+
+def _number(value: float | None, *, signed: bool = False) -> str:
+    if value is None:
+        return "–"
+    return f"{value:+.2f}" if signed else f"{value:.2f}"
