@@ -5,8 +5,9 @@ over at focus. **The original's formula was not at hand; this is our reading of 
 the OFF rate scaled by g = ΣP/ΣN the running sum of P - g·N starts and ends at zero, and focus is its extremum: the
 point where the balance tips, found from all events at once instead of from the noise of a single bin's difference.
 
-Known to work on sparse bright or dark objects; a texture with as much bright as dark has nothing to tip and the answer
-is where chance puts it. It needs the complete stack.
+Known to work on sparse bright or dark objects. A texture as bright as dark tips too, but less: blurring raises the mean
+of a logarithm, so a picture that sharpens gets darker on the whole. Whatever else makes events of one polarity, a lamp
+that comes on in mid-sweep, carries the extremum away with it. It needs the complete stack.
 """
 
 from __future__ import annotations
