@@ -233,6 +233,27 @@ class RigParts:
     truth: Truth | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """Something that is plugged in: a serial port, a camera on the USB.
+
+    ``next_step`` says what a person must do before it can be used, ``None`` where nothing stands in the way.
+    """
+
+    kind: str
+    name: str
+    where: str
+    next_step: str | None = None
+
+
+class Discovery(Protocol):
+    """A look around without opening anything: what an entry point of the group ``elpd.discovery`` names."""
+
+    def __call__(self) -> Sequence[FoundDevice]:
+        """Return what is there now. Raises ``DeviceError`` if looking is impossible, with the reason."""
+        ...
+
+
 class RunningBoard(Protocol):
     """A simulated controller behind a pty."""
 

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 EMPTY = 2**31 - 1
 SLOTS = 3
 HOT, UNFIRED = 3, 4
 
 
-def latch_first_on(t_us, x, y, on, begin_us, end_us, width, height):
+def latch_first_on(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    begin_us: int,
+    end_us: int,
+    width: int,
+    height: int,
+) -> tuple[NDArray[np.int32], NDArray[np.uint16], list[int]]:
     """Return times (3, height, width), counts before (height, width), and the tally on, before, after, outside."""
-    held = {}
+    held: dict[tuple[int, int], list[int]] = {}
     before = np.zeros((height, width), np.uint16)
     tally = [0, 0, 0, 0]
     for t, column, row, polarity in zip(t_us.tolist(), x.tolist(), y.tolist(), on.tolist(), strict=True):
@@ -34,7 +48,9 @@ def latch_first_on(t_us, x, y, on, begin_us, end_us, width, height):
     return slots, before, tally
 
 
-def believe(times, choice, slots, jitter):
+def believe(
+    times: NDArray[np.int32], choice: NDArray[np.uint8], slots: NDArray[np.int32], jitter: float
+) -> tuple[NDArray[np.int32], NDArray[np.uint8], int]:
     """Return the times and choices after one pass, and how many pixels moved."""
     height, width = times.shape
     new_times, new_choice = times.copy(), choice.copy()
@@ -53,11 +69,9 @@ def believe(times, choice, slots, jitter):
             fired = sorted(time for time in around if time != EMPTY)
             silent = len(around) - len(fired)
             if len(fired) <= 2:
-                verdict, limit = UNFIRED, EMPTY
+                verdict, limit = UNFIRED, float(EMPTY)
             else:
-                middle = fired[len(fired) // 2]
-                spread = sorted(abs(time - middle) for time in fired)[len(fired) // 2]
-                tolerance = 5.0 * max(1.4826 * spread, jitter * middle)
+                tolerance = 5.0 * jitter * fired[len(fired) // 2]
                 margin = 5.0 * jitter * own
                 n_early = sum(time <= own + margin for time in fired)
                 n_late = sum(time >= own - margin for time in fired) + silent
@@ -66,7 +80,7 @@ def believe(times, choice, slots, jitter):
                 if not too_early and not too_late:
                     continue
                 verdict = HOT if too_early else UNFIRED
-                limit = min(fired[-1] + tolerance, EMPTY)
+                limit = min(fired[-1] + tolerance, float(EMPTY))
             moved += 1
             slot = int(choice[row, column]) + 1
             if slot < SLOTS and slots[slot, row, column] < limit:

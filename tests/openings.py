@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
 CONTRAST = 0.3
 
@@ -14,16 +20,16 @@ CONTRAST = 0.3
 class Opening:
     """Events as columns, and the truth: log intensity, when the opening began, which pixels stayed dark."""
 
-    t_us: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    on: np.ndarray
-    log_intensity: np.ndarray
+    t_us: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    on: NDArray[np.uint8]
+    log_intensity: NDArray[np.float64]
     open_us: int
-    dark: np.ndarray
+    dark: NDArray[np.bool_]
 
 
-def natural_scene(seed, height=120, width=160):
+def natural_scene(seed: int, height: int = 120, width: int = 160) -> NDArray[np.float64]:
     """Return a log intensity with a 1/f spectrum through a lens: 3 decades, no detail finer than a pixel or two."""
     random = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
@@ -31,22 +37,23 @@ def natural_scene(seed, height=120, width=160):
     spectrum = np.fft.rfft2(random.normal(size=(height, width))) / frequency**1.3
     spectrum[0, 0] = 0.0
     scene = cv2.GaussianBlur(np.fft.irfft2(spectrum, (height, width)), (0, 0), 1.0)
-    return scene * (3 * np.log(10) / (scene.max() - scene.min()))
+    scaled: NDArray[np.float64] = scene * (3 * np.log(10) / (scene.max() - scene.min()))
+    return scaled
 
 
 def record(
-    scene,
+    scene: NDArray[np.float64],
     *,
-    exponent=2,
-    duration_us=20_000,
-    lead_us=0,
-    mismatch=0.0,
-    noise_hz=0.0,
-    hot=(),
-    dark=None,
-    start_us=5_000_000,
-    seed=0,
-):
+    exponent: float = 2,
+    duration_us: int = 20_000,
+    lead_us: int = 0,
+    mismatch: float = 0.0,
+    noise_hz: float = 0.0,
+    hot: Sequence[tuple[int, int]] = (),
+    dark: NDArray[np.bool_] | None = None,
+    start_us: int = 5_000_000,
+    seed: int = 0,
+) -> Opening:
     """Open an aperture of T = (t/duration)^exponent over *scene*; the brightest pixel fires at 4 % of the opening.
 
     *lead_us* of closed aperture come first; pixels of *hot* fire at 2 kHz all the time; *dark* pixels see no light.

@@ -117,3 +117,9 @@ class _NoEvents:
 
 
 _NO_EVENTS: Any = _NoEvents()
+
+
+def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Spearman's rho, ties in order of appearance."""
+    ranks = [np.argsort(np.argsort(v.ravel(), kind="stable"), kind="stable") for v in (a, b)]
+    return float(np.corrcoef(*ranks)[0, 1])

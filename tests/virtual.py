@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Protocol
 
 from elpd.units import HostNs
@@ -36,3 +37,13 @@ class TestClock:
             self.sleep_until(HostNs(min(end, self._now + round(step_ms * 1e6))))
             if each is not None:
                 each()
+
+
+class MonotonicClock:
+    """The machine's own clock, for tests against a pty: it waits, but nothing is asserted about how long."""
+
+    def now_ns(self) -> HostNs:
+        return HostNs(time.monotonic_ns())
+
+    def sleep_until(self, when: HostNs) -> None:
+        time.sleep(max(0.0, (when - time.monotonic_ns()) / 1e9))

@@ -49,9 +49,10 @@ def score(case: Path, options: list[str]) -> dict[str, Any]:
     truth = json.loads((case / "truth.json").read_text())
     more = [first_frame(case) if one == "FIRST" else one for one in options]
     if truth.get("aperture_open_s") and "--aperture-us" not in more:
-        more += ["--aperture-us", f"0,{round(truth['aperture_open_s'][0] * 1e6)}", "--frames", "none"]
+        opened_us = round(truth["aperture_open_s"][0] * 1e6)
+        more += ["--aperture-us", f"0,{opened_us}", "--transmittance", "linear", "--frames", "none"]
     started = time.perf_counter()
-    run = subprocess.run(
+    run = subprocess.run(  # noqa: S603  (our own program)
         [sys.executable, "-c", "from elpd.cli import main; main()", "detect", str(case), "--json", *more],
         capture_output=True,
         text=True,
@@ -99,13 +100,16 @@ def verdict(truth_us: int | None, outcome: str | None, error_um: float | None) -
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Print one line per case."""
-    print(f"{'case':34} {'outcome':15} {'direction':12} {'error':>7} {'sigma':>6} {'decided':>8} {'elp':>7} {'s':>5} verdict")
+    print(
+        f"{'case':34} {'outcome':15} {'direction':12} {'error':>7} {'sigma':>6} "
+        f"{'decided':>8} {'elp':>7} {'s':>5} verdict"
+    )
     for row in rows:
         numbers = [row["error_um"], row["sigma_um"], row["decided_um"], row["crossing_um"]]
         texts = ["-" if one is None else f"{one:+.1f}" for one in numbers]
         print(
-            f"{row['case'][:34]:34} {row['outcome'] or row['error']!s:15} {row['direction'] or '-':12} {texts[0]:>7} {texts[1]:>6} "
-            f"{texts[2]:>8} {texts[3]:>7} {row['seconds']:5.1f} {row['verdict']}"
+            f"{row['case'][:34]:34} {row['outcome'] or row['error']!s:15} {row['direction'] or '-':12} "
+            f"{texts[0]:>7} {texts[1]:>6} {texts[2]:>8} {texts[3]:>7} {row['seconds']:5.1f} {row['verdict']}"
         )
 
 

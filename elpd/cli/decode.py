@@ -63,7 +63,7 @@ def summarise(reader: RecordingReader) -> dict[str, Any]:
         if chunk.t.size == 0:
             continue
         for (name, dtype), column in zip(DIGEST_DTYPES.items(), (chunk.t, chunk.x, chunk.y, chunk.p), strict=True):
-            digests[name].update(np.ascontiguousarray(column).astype(dtype, copy=False))
+            digests[name].update(np.ascontiguousarray(column, dtype).data)
         events += chunk.t.size
         on += int(chunk.p.sum())
         t = chunk.t if last_us is None else np.concatenate(([last_us], chunk.t))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,10 @@ import numpy as np
 
 from elpd.cli.common import json_option, parse_interval_us, parse_roi, print_json
 from elpd.errors import FormatError, UsageError
+from elpd.record.journal import is_run
 from elpd.record.layouts import read_sweep
 from elpd.record.paper_sweep import detect_as_published
+from elpd.record.run_sweep import read_run_sweep
 from elpd.record.sweep_file import SweepSearch
 from elpd.records import Geometry, Outcome
 from elpd.units import SensorUs
@@ -30,9 +33,11 @@ if TYPE_CHECKING:
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--roi", "roi_text", metavar="X,Y,W,H", help="Where to focus; by default info.txt's region, or all.")
 @click.option("--frames", metavar="DIR|none", help="Folder of frames, relative to PATH, or none.")
-@click.option("--reference", "reference_path", type=click.Path(path_type=Path), help="An image that is there from the start.")
+@click.option(
+    "--reference", "reference_path", type=click.Path(path_type=Path), help="An image that is there from the start."
+)
 @click.option("--aperture-us", "aperture_text", metavar="A,B", help="The aperture opened in this interval.")
-@click.option("--transmittance", default="linear", metavar="linear|iris|FILE", help="How it opened.")
+@click.option("--transmittance", default="iris", show_default=True, metavar="linear|iris|FILE", help="How it opened.")
 @click.option("--speed-um-s", type=float, help="Constant speed of the lens.")
 @click.option("--lens-path", "lens_path", type=click.Path(path_type=Path), help="CSV with rows t_us,position_um.")
 @click.option("--dof-um", type=float, help="Depth of focus.")
@@ -60,7 +65,14 @@ def command(
         raise UsageError(f"--dof-um must be positive; got {dof_um}")
     pixels = None if reference_path is None else load_image(reference_path)
     size = None if pixels is None else Geometry(pixels.shape[1], pixels.shape[0])
-    sweep = read_sweep(path, frames=frames, size=size)
+    recorded = read_run_sweep(path) if is_run(path) else None
+    if recorded is None:
+        sweep = read_sweep(path, frames=frames, size=size)
+    else:
+        sweep = replace(recorded.sweep, frames=()) if frames == "none" else recorded.sweep
+        aperture_us = aperture_us or recorded.aperture_us
+        if speed_um_s is None and lens_path is None:
+            ruler = Ruler.of_path(recorded.path_t_us, recorded.path_um)
     for warning in sweep.warnings:
         print(f"elpd: {path}: {warning}", file=sys.stderr)
     roi = roi or sweep.roi
@@ -78,6 +90,8 @@ def command(
         picture = temporal_image(first.believed(), read_transmittance(transmittance), SensorUs(aperture_us[0]))
         reference = reference_from_temporal_image(picture, roi)
         begin_us = aperture_us[1]
+    if recorded is not None:
+        begin_us = recorded.begin_us
     if pixels is not None:
         check_size(pixels.shape, sweep.geometry, str(reference_path))
         reference = reference_from_frame(pixels, roi)

@@ -55,10 +55,11 @@ def focus_once(
     parts = rig.build(config)
     try:
         with RunWriter.begin(config, request, parts) as run:
-            cycle = FocusCycle(run.parts, CycleSettings.from_config(config), request, run, observer, cancelled)
+            settings = CycleSettings.from_config(config)
+            cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))
             result = cycle.run()
-            run.finish(result_fields(result))
-        truth = None if parts.truth is None else parts.truth.errors(result)
+            truth = None if parts.truth is None else parts.truth.errors(result)
+            run.finish(result_fields(result), truth=truth)
         return Session(result, truth, run.path, cycle.map)
     finally:
         rig.release(parts)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from elpd.cli.common import config_options, json_option, parse_interval_us, print_json
-from elpd.cli.recordings import open_recording
 from elpd.errors import FormatError, UsageError
+from elpd.events.registers import MAX_SIDE
+from elpd.events.stream import EventStream, open_recording
+from elpd.records import Geometry
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.pictures import write_display_png, write_log_png
@@ -36,6 +38,7 @@ PNG = click.Path(path_type=Path, dir_okay=False)
     metavar="linear|iris|FILE",
     help="How it opens: area grows evenly (linear), diameter grows evenly (iris), or a CSV of t_us,transmittance.",
 )
+@click.option("--size", metavar="W,H", help="The sensor's size in pixels, for files that do not say it.")
 @click.option("--out", type=PNG, help="Write the picture as 16-bit PNG, monotone in log intensity.")
 @click.option("--display", type=PNG, help="Write an 8-bit PNG for eyes as well (1st to 99th percentile).")
 @json_option
@@ -44,6 +47,7 @@ def command(
     file: Path,
     interval: str | None,
     transmittance: str,
+    size: str | None,
     out: Path | None,
     display: Path | None,
     *,
@@ -59,7 +63,7 @@ def command(
     del config_path, overrides  # accepted by every command; nothing here is configurable
     aperture = parse_interval_us(interval, "--aperture-us")
     profile = read_transmittance(transmittance)
-    gathered = _gather(file, aperture)
+    gathered = _gather(file, aperture, _parse_size(size))
     image = temporal_image(gathered.believed(), profile, None if aperture is None else SensorUs(aperture[0]))
     usable, verdict = quality(image)
     if out is not None:
@@ -84,30 +88,41 @@ def command(
         _tell(image, out, "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
 
 
-def _gather(file: Path, aperture: tuple[int, int] | None) -> FirstEventMap:
-    """Read as much of the recording as the opening needs."""
+def _parse_size(text: str | None) -> Geometry | None:
+    if text is None:
+        return None
+    try:
+        width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--size is W,H in whole pixels, such as 346,260; got {text!r}") from None
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise UsageError(f"--size {width},{height}: a sensor has 1 to {MAX_SIDE} pixels each way")
+    return Geometry(width, height)
+
+
+def _gather(file: Path, aperture: tuple[int, int] | None, size: Geometry | None) -> FirstEventMap:
+    """Read as much of the recording as the opening needs; all of it if nothing is found, to say what it holds."""
     begin_us, end_us = aperture if aperture is not None else (None, None)
     reader = open_recording(file)
     try:
-        if reader.geometry is None:
+        geometry = size or reader.geometry
+        if geometry is None:
             raise FormatError(
-                f"{file}: the file does not say how large the sensor is, which a map needs; "
-                "convert it to a format whose header has a geometry"
+                f"{file}: the file does not say how large the sensor is, which a map needs; give --size W,H"
             )
-        gathered = FirstEventMap(reader.geometry, begin_us, end_us)
-        for packet in reader.packets():
-            gathered.add_packet(packet)
-            if gathered.complete:
+        gathered = FirstEventMap(geometry, begin_us, end_us)
+        for chunk in EventStream(reader, geometry).chunks():
+            gathered.add(chunk.t, chunk.x, chunk.y, chunk.p)
+            if gathered.complete and gathered.n_on:
                 break
     finally:
         reader.close()
     if gathered.first_us is None:
-        raise FormatError(f"{file}: holds no event; record with the aperture opening, then try again")
+        raise FormatError(f"{file}: holds no event inside the sensor; record while the aperture opens")
     if gathered.n_on == 0 and aperture is not None:
-        held = f"from {gathered.first_us} us" + ("" if gathered.complete else f" to {gathered.last_us} us")
         raise UsageError(
-            f"no ON event between {begin_us} and {end_us} us; the recording has events {held}, "
-            f"{gathered.n_before} of them ON before the interval; choose --aperture-us inside it"
+            f"no ON event between {begin_us} and {end_us} us: the recording's events are from {gathered.first_us} to "
+            f"{gathered.last_us} us, {gathered.n_before} of them ON before the interval; choose --aperture-us A,B there"
         )
     return gathered
 

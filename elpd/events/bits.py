@@ -12,7 +12,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 
-@intrinsic  # type: ignore[misc, unused-ignore]  # numba ships no types for its decorators
+@intrinsic  # type: ignore[untyped-decorator]  # numba ships no types
 def trailing_zeros(typing_context: Any, value: Any) -> Any:
     """Return the index of the lowest set bit of a ``uint32``; 32 for zero."""
     del typing_context

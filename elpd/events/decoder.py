@@ -12,8 +12,6 @@ import numpy as np
 
 from elpd.events.registers import (
     HIGH,
-    LOOP,
-    LOW,
     check_geometry,
     counters,
     forget_addresses,
@@ -21,13 +19,14 @@ from elpd.events.registers import (
     new_triggers,
     rate_controller,
     take_triggers,
+    time_of,
 )
-from elpd.units import SensorUs
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Trigger
+    from elpd.units import SensorUs
 
 
 class EventArrays(NamedTuple):
@@ -105,11 +104,13 @@ class WordDecoder:
         position, written = self._kernel(words, 0, self._state, width, height, *self._out, self._held_triggers)
         while position < words.shape[0]:
             self._out = _with_capacity(self._out, written, 2 * self._out.t.shape[0])
-            room = EventArrays(*(column[written:] for column in self._out))
+            t, x, y, p = self._out
+            room = (t[written:], x[written:], y[written:], p[written:])
             position, more = self._kernel(words, position, self._state, width, height, *room, self._held_triggers)
             written += more
         self.triggers = take_triggers(self._state, self._held_triggers)
-        return EventArrays(*(column[:written] for column in self._out))
+        t, x, y, p = self._out
+        return EventArrays(t[:written], x[:written], y[:written], p[:written])
 
     def forget_addresses(self) -> None:
         """Say that words are missing here: rows and vector bases from before them hold no more."""
@@ -123,8 +124,7 @@ class WordDecoder:
         """
         if self._state[HIGH] < 0:
             return None
-        high = (int(self._state[LOOP]) << self._high_bits) + int(self._state[HIGH])
-        return SensorUs((high << self._low_bits) + int(self._state[LOW]))
+        return time_of(self._state, self._low_bits, self._high_bits)
 
     @property
     def rate_controller(self) -> tuple[int, int] | None:
@@ -151,6 +151,8 @@ def _with_capacity(events: EventArrays, used: int, capacity: int) -> EventArrays
     if events.t.shape[0] >= capacity:
         return events
     larger = _allocate(capacity)
-    for old, new in zip(events, larger, strict=True):
-        new[:used] = old[:used]
+    larger.t[:used] = events.t[:used]
+    larger.x[:used] = events.x[:used]
+    larger.y[:used] = events.y[:used]
+    larger.p[:used] = events.p[:used]
     return larger

@@ -33,6 +33,7 @@ from elpd.events.registers import (
     RESERVED,
     X_OUT_OF_RANGE,
     Y_OUT_OF_RANGE,
+    Integer,
     hold_trigger,
 )
 
@@ -69,7 +70,7 @@ def swap_halves(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 @kernel()
-def take_time_high(content: int, state: NDArray[np.int64]) -> None:
+def take_time_high(content: Integer, state: NDArray[np.int64]) -> None:
     """Set the upper part of time; a repeated one changes nothing."""
     high = state[HIGH]
     if content != high:
@@ -80,11 +81,10 @@ def take_time_high(content: int, state: NDArray[np.int64]) -> None:
 
 
 @kernel()
-def take_rare_evt2_word(word: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
+def take_rare_evt2_word(word: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
     """Account for a word that is neither an event nor TIME_HIGH. *t* is its time, where it has one."""
     kind = word >> 28
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (word >> 8) & 0x1F, word & 1, state, triggers)
     elif kind in (0xE, 0xF):
         state[OTHERS] += 1
@@ -94,16 +94,14 @@ def take_rare_evt2_word(word: int, t: int, state: NDArray[np.int64], triggers: N
 
 @kernel()
 def take_rare_evt21_word(
-    kind: int, upper: int, lower: int, t: int, state: NDArray[np.int64], triggers: NDArray[np.int64]
+    kind: Integer, upper: Integer, lower: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]
 ) -> None:
     """Account for a word, given as its halves, that is neither an event nor TIME_HIGH."""
     if kind == 0xA:
-        state[LOW] = t & 0x3F
         hold_trigger(t, (upper >> 8) & 0x1F, upper & 1, state, triggers)
     elif kind == 0xE:
         subtype = upper & 0xFFFF
         if subtype in (COUNT_BEFORE_CONTROLLER, COUNT_AFTER_CONTROLLER):
-            state[LOW] = t & 0x3F
             state[RATE_BEFORE if subtype == COUNT_BEFORE_CONTROLLER else RATE_AFTER] += lower & COUNT_MASK
             state[RATE_COUNTS] += 1
         else:

@@ -21,6 +21,8 @@ from elpd.events.jit import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from elpd.events.registers import Integer
+
 WIDTH, LAST_HIGH, LAST_LOW, LAST_ROW, HIGH_SENT_US, NEXT_BASE, BASE_ON = 0, 1, 2, 3, 4, 5, 6
 STATE_SIZE = 7
 
@@ -110,7 +112,7 @@ def encode(
             state[LAST_ROW] = row
         base = np.int64(x[i]) & 0x7E0
         on = np.int64(p[i] == 1)
-        mask = 0
+        mask: Integer = 0
         run = 0
         if base + 32 <= state[WIDTH]:
             last = np.int64(-1)

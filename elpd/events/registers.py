@@ -8,7 +8,7 @@ argument. EVT2 and EVT2.1 use the time registers and the tallies alone.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Geometry
+
+Integer = int | np.integer[Any]
+"""What integers are inside a kernel, as far as a type checker can tell."""
 
 LOOP, HIGH, LOW, ROW, VECTOR_X, VECTOR_ON = 0, 1, 2, 3, 4, 5
 OTHERS_SUBTYPE, CONTINUED_SEEN, CONTINUED_VALUE = 6, 7, 8
@@ -80,7 +83,9 @@ def take_triggers(state: NDArray[np.int64], triggers: NDArray[np.int64]) -> tupl
 
 
 @kernel()
-def hold_trigger(t: int, channel: int, rising: int, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
+def hold_trigger(
+    t: Integer, channel: Integer, rising: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]
+) -> None:
     """Keep a trigger edge until ``take_triggers``, or count it as lost."""
     state[TRIGGERS] += 1
     held = state[TRIGGERS_HELD]
@@ -91,6 +96,11 @@ def hold_trigger(t: int, channel: int, rising: int, state: NDArray[np.int64], tr
         state[TRIGGERS_HELD] = held + 1
     else:
         state[TRIGGERS_LOST] += 1
+
+
+def time_of(state: NDArray[np.int64], low_bits: int, high_bits: int) -> SensorUs:
+    """Return the time that the registers stand at, for an encoding with so many bits below and in TIME_HIGH."""
+    return SensorUs((((int(state[LOOP]) << high_bits) + int(state[HIGH])) << low_bits) + int(state[LOW]))
 
 
 def counters(state: NDArray[np.int64]) -> dict[str, int]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from elpd.errors import FormatError
+from elpd.events.decoder import EventArrays
 from elpd.events.evt2 import Evt2Decoder, Evt21Decoder
 from elpd.events.evt3 import Evt3Decoder
 from elpd.events.layout import event_columns
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from elpd.events.decoder import WordDecoder
     from elpd.ports import RecordingFormat, RecordingReader
-    from elpd.records import Frame, Trigger
+    from elpd.records import CameraPacket, Frame, Trigger
 
 FORMATS_GROUP = "elpd.formats"
 DECODERS: dict[Encoding, type[Evt3Decoder | Evt2Decoder | Evt21Decoder]] = {
@@ -82,6 +83,25 @@ def open_recording(path: Path) -> RecordingReader:
     raise FormatError(
         f"{path} ({size} bytes, beginning {beginning!r}) is in no format that is installed here; there are: {names}"
     )
+
+
+class PacketDecoder:
+    """A camera's packets as columns of events, whatever their encoding; state is carried from packet to packet."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self._geometry = geometry
+        self._decoder: WordDecoder | None = None
+
+    def feed(self, packet: CameraPacket) -> EventArrays:
+        """Decode one packet: views, valid until the next. Events outside the sensor are dropped."""
+        if packet.encoding is Encoding.ARRAY:
+            t, x, y, p = event_columns(packet.data)
+            return EventArrays(t.astype(np.int64, copy=False), x, y, np.asarray(p == 1, np.uint8))
+        if self._decoder is None:
+            self._decoder = DECODERS[packet.encoding](self._geometry)
+        if packet.gap_before:
+            self._decoder.forget_addresses()
+        return self._decoder.feed(packet.data)
 
 
 class EventStream:

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 from elpd.errors import CameraError, DeviceError, UsageError
 from elpd.focus import safety
 from elpd.focus.expose import expose
+from elpd.focus.picture import Picture
 from elpd.focus.stage import Stage
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
-from elpd.focus.watch import Watch
+from elpd.focus.watch import Watch, WatchSettings
 from elpd.ports import Biases, HardwareRoi
 from elpd.records import (
     BiasSet,
@@ -32,7 +33,7 @@ from elpd.records import (
 )
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
 from elpd.vision.choose import propose_roi
-from elpd.vision.reference import Reference
+from elpd.vision.reference import reference_from_frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,9 +41,13 @@ if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings, FocusRequest
     from elpd.ports import RigParts, RunSink
     from elpd.records import ElpSample, LensReport, TemporalImage
+    from elpd.vision.reference import Reference
 
 BIAS_SETTLE_MS = 10.0
 """After new biases or a new window a sensor needs a few ms before its events mean anything."""
+
+FRAME_LIMIT_MS = 500.0
+"""A camera with frames delivers one within this, or has none."""
 
 REST_LIMIT_MS = 1500.0
 """No lens this is for rings or brakes longer; past it the lens does not obey."""
@@ -157,9 +162,9 @@ class FocusCycle:
     def _focus(self) -> tuple[Outcome, str]:
         self._phase(Phase.SETTLE_BEFORE)
         self._start_um = self._stage.to_um(self._stage.rest(REST_LIMIT_MS).steps)
-        reference = self._reference()
+        picture = self._picture()
         self._phase(Phase.CHOOSE)
-        roi = self._choose(reference)
+        roi, reference = self._choose(picture)
         watch = self._arm(reference, roi)
         if self._request.dry_run:
             raise _Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
@@ -168,19 +173,28 @@ class FocusCycle:
         rest = self._stage.rest(REST_LIMIT_MS)
         self._stop_um = self._stage.to_um(rest.steps)
         self._stop_latency_us = self._latency_us(watch, rest)
-        estimate = watch.estimate()
-        self._judge(watch, estimate, passed)
+        estimate = self._judge(watch, passed)
         self._return(estimate, passed)
         return Outcome.FOCUSED, self._sentence(estimate)
 
-    def _reference(self) -> Reference:
+    def _picture(self) -> Picture:
         """Get a picture of the scene: a stored one, an opening aperture's, or the newest frame."""
-        geometry = self._parts.camera.geometry
-        if self._request.reference is not None:
-            return Reference.from_file(self._request.reference, geometry)
-        if self._parts.aperture is not None:
-            self._phase(Phase.EXPOSE)
-            self.map, quality = expose(self._stage, self._settings.transmittance)
+        request, geometry = self._request, self._parts.camera.geometry
+        if request.stored_map is not None:
+            return Picture.of_map(request.stored_map)
+        if request.reference is not None:
+            return Picture.of_file(request.reference, geometry)
+        if self._parts.aperture is None:
+            frame = self._stage.newest_frame(FRAME_LIMIT_MS)
+            if frame is None:
+                raise UsageError(
+                    "this camera delivers no frames and the rig has no aperture to expose with; "
+                    "give --reference IMAGE, or configure an aperture"
+                )
+            return Picture.of_frame(frame.pixels)
+        self._phase(Phase.EXPOSE)
+        self.map, (good, reason) = expose(self._stage, self._settings.transmittance)
+        if self.map is not None:
             self._sink.note(
                 "map",
                 fired_fraction=self.map.fired_fraction,
@@ -188,41 +202,45 @@ class FocusCycle:
                 open_us=int(self.map.open_us),
                 dynamic_range_db=self.map.dynamic_range_db,
             )
-            if not quality.ok:
-                raise _Ended(Outcome.NO_TEXTURE, quality.reason)
-            return Reference.from_temporal_image(self.map)
-        frame = self._stage.newest_frame(500.0)
-        if frame is None:
-            raise UsageError(
-                "this camera delivers no frames and the rig has no aperture to expose with; "
-                "give --reference IMAGE, or configure an aperture"
-            )
-        return Reference.from_frame(frame)
+        if self.map is None or not good:
+            raise _Ended(Outcome.NO_TEXTURE, reason)
+        return Picture.of_map(self.map)
 
-    def _choose(self, reference: Reference) -> Roi:
+    def _choose(self, picture: Picture) -> tuple[Roi, Reference]:
         geometry = self._parts.camera.geometry
         roi = self._request.roi
         if roi is None:
             side = round(self._settings.roi_fraction * min(geometry.width, geometry.height))
-            roi = propose_roi(reference.log_image, reference.valid, side)
+            roi = propose_roi(picture.log_image, picture.valid, (side, side))
         if roi is None:
             raise _Ended(Outcome.NO_TEXTURE, "nothing in the picture has texture above its noise; aim at a subject")
         self._details["roi"] = [roi.x, roi.y, roi.width, roi.height]
-        texture = reference.texture(roi)
-        self._sink.note("roi", roi=self._details["roi"], texture=texture.score, textured=texture.ok)
-        if not texture.ok:
-            raise _Ended(Outcome.NO_TEXTURE, texture.reason)
-        return roi
+        reference = picture.reference(roi)
+        self._sink.note("roi", roi=self._details["roi"], texture=reference.texture, scale_px=reference.scale_px)
+        if not reference.textured:
+            raise _Ended(
+                Outcome.NO_TEXTURE,
+                f"the picture shows no structure above its own noise in the ROI ({reference.texture:.1f} sigma, "
+                "at least 6 are needed); choose another ROI or add light",
+            )
+        return roi, reference
 
     def _arm(self, reference: Reference, roi: Roi) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
-        camera, geometry = self._parts.camera, self._parts.camera.geometry
+        camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
             camera.apply_biases(BiasSet.FOCUS)
         if isinstance(camera, HardwareRoi):
             camera.set_window(widened(roi, ROI_MARGIN_PX, geometry.width, geometry.height))
         self._stage.wait_ms(BIAS_SETTLE_MS)
-        watch = Watch(reference, roi, geometry, self._settings, self._stage.position_um)
+        watch = Watch(
+            reference,
+            roi,
+            geometry,
+            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=self.map is None),
+            self._stage.position_um,
+            lambda frame: reference_from_frame(frame.pixels, roi),
+        )
         self._watch = watch
         self._stage.listener = watch.rest
         self._stage.wait_ms(BIAS_SETTLE_MS)
@@ -237,12 +255,14 @@ class FocusCycle:
             raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
+        turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
         self._stage.listener = None
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
+        turned_at_um: float | None = None
         while True:
             self._details["sweep_sign"] = sign
             plan = SweepPlan(
@@ -250,9 +270,11 @@ class FocusCycle:
                 speed_um_s=speed_um_s,
                 max_travel_um=reach_um,
                 braking_um=braking_um,
+                turn_s=turn_s,
                 deadline_ns=self._deadline_ns,
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
+                turned_at_um=turned_at_um,
             )
             self._phase(Phase.SWEEP, sign=sign, position_um=self._here_um())
             report = sweep.run(plan)
@@ -278,14 +300,16 @@ class FocusCycle:
                     f"focus seemed to lie behind {self._reversals + 1} times; "
                     "does the subject move in depth? raise focus.max_reversals or hold it still",
                 )
+            turned_at_um = self._here_um() if report.end is SweepEnd.BEHIND else None
             if report.end is SweepEnd.RULE:
                 self._stage.rest(REST_LIMIT_MS)
             self._reversals += 1
             reach_um = self._settings.max_travel_um + abs(self._here_um() - report.begun_um) + 2 * braking_um
             sign = -sign
 
-    def _judge(self, watch: Watch, estimate: FocusEstimate | None, passed: SweepReport) -> None:
-        """Refuse an answer that the evidence does not carry."""
+    def _judge(self, watch: Watch, passed: SweepReport) -> FocusEstimate:
+        """Say where focus was, and refuse an answer that the evidence does not carry."""
+        estimate = watch.estimate()
         if estimate is None:
             raise _Ended(
                 Outcome.LOW_CONFIDENCE,
@@ -316,6 +340,7 @@ class FocusCycle:
                 f"focus was put at {estimate.focus_um:.1f} um, which the sweep ({passed.begun_um:.1f} to "
                 f"{stop_um:.1f}) has not reached",
             )
+        return estimate
 
     def _return(self, estimate: FocusEstimate, passed: SweepReport) -> None:
         """Go back to where focus was, from the side the sweep came from, and see that the lens is there."""
@@ -329,6 +354,7 @@ class FocusCycle:
         way_back_um = abs(self._stop_um - estimate.focus_um)
         expected = watch.events_within(estimate.focus_um, self._stop_um)
         before = watch.events_in_cycle
+        stage.listener = watch.count
         beyond_um = estimate.focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM)
         for target_um in (beyond_um, estimate.focus_um):
             bounded = min(max(stage.to_steps(target_um), limits.min_steps), limits.max_steps)

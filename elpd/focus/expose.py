@@ -54,7 +54,7 @@ def expose(
 
     def latch(packet: CameraPacket) -> None:
         events = decoder.feed(packet)
-        first.add(events.t, events.x, events.y, events.on)
+        first.add(events.t, events.x, events.y, events.p)
 
     stage.listener = latch
     try:

@@ -25,6 +25,9 @@ DARK_TRAVEL_DOF = 8.0
 STUCK_TRAVEL_DOF = 4.0
 """The commanded motion must show in the reports before the lens should have travelled this far."""
 
+STUCK_SHARE = 0.2
+"""A lens that has done less than a fifth of what it was told is stuck, not slow."""
+
 LOSS_LIMIT = 0.2
 """Sums stay fair while a sensor sheds whole slices; beyond a fifth lost, nobody knows what was shed."""
 
@@ -47,8 +50,10 @@ class Conditions:
     camera_silent_ms: float = 0.0
     travel_um: float = 0.0
     """Modelled travel since this sweep direction began."""
+    commanded_travel_um: float = 0.0
+    """Travel that the commands alone ask for at the time of the newest report, turning and starting allowed for."""
     reported_travel_um: float | None = None
-    """Travel by the controller's reports, ``None`` before the first one."""
+    """Travel by the controller's newest report, ``None`` before the first one."""
     max_travel_um: float = float("inf")
     way_to_limit_um: float = float("inf")
     depth_of_focus_um: float = 6.0
@@ -94,12 +99,13 @@ def _verdicts(now: Conditions) -> Iterator[Verdict]:
             f"{now.lost_fraction:.0%} of the events were lost (limit {LOSS_LIMIT:.0%}); "
             "choose a smaller ROI, a slower sweep or a higher contrast threshold",
         )
-    stuck_um = STUCK_TRAVEL_DOF * now.depth_of_focus_um
-    if now.reported_travel_um is not None and now.travel_um > stuck_um and now.reported_travel_um < 0.2 * now.travel_um:
+    asked_um = now.commanded_travel_um
+    stuck = asked_um > STUCK_TRAVEL_DOF * now.depth_of_focus_um
+    if stuck and now.reported_travel_um is not None and now.reported_travel_um < STUCK_SHARE * asked_um:
         yield Verdict(
             Action.GIVE_UP,
             Outcome.LENS_DID_NOT_MOVE,
-            f"the lens should have moved {now.travel_um:.0f} um and reports {now.reported_travel_um:.0f}; "
+            f"the lens should have moved {asked_um:.0f} um and reports {now.reported_travel_um:.0f}; "
             "check that the motor is energised and free",
         )
     dark_um = DARK_TRAVEL_DOF * now.depth_of_focus_um

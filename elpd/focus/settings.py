@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from elpd.config import Config
-    from elpd.records import Roi
+    from elpd.records import Roi, TemporalImage
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,13 @@ class CycleSettings:
 
 @dataclass(frozen=True, slots=True)
 class FocusRequest:
-    """One request. ``reference`` is an image file or a stored map; ``None`` exposes or takes the newest frame."""
+    """One request.
+
+    The picture to focus on is ``stored_map``, or the image file ``reference``, or, with neither, what the aperture's
+    opening or the newest frame shows.
+    """
 
     roi: Roi | None = None
     reference: Path | None = None
+    stored_map: TemporalImage | None = None
     dry_run: bool = False

@@ -42,9 +42,13 @@ class SweepPlan:
     speed_um_s: float
     max_travel_um: float
     braking_um: float
+    turn_s: float
+    """Time to come from full speed the other way to full speed this way, the stop's onset included."""
     deadline_ns: HostNs
     depth_of_focus_um: float
     stop_mode: StopMode
+    turned_at_um: float | None = None
+    """Where the reversal that led to this direction was commanded; ``None`` if there was none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +87,7 @@ class Sweep:
         until = min(plan.deadline_ns, after_ms(begun_ns, 1000.0 * travel_s + 500.0))
         reported_from = stage.report
         lens.run(plan.sign * plan.speed_um_s / stage.um_per_step, until)
-        watch.begin(plan.sign, stage.sensor_clock.to_sensor(begun_ns))
+        watch.begin(plan.sign, stage.sensor_clock.to_sensor(begun_ns), plan.turned_at_um)
         heard_ns = begun_ns
         while True:
             packet = stage.read(READ_TIMEOUT_S)
@@ -109,8 +113,10 @@ class Sweep:
         now = stage.now_ns()
         here_um = stage.to_um(stage.parts.lens.position_at(now).steps)
         report = stage.report
-        fresh = report is not None and report is not reported_from and report.earliest_ns > begun_ns
-        reported_um = abs(stage.to_um(report.steps) - begun_um) if fresh and report is not None else None
+        reported_um, commanded_um = None, 0.0
+        if report is not None and report is not reported_from and report.earliest_ns > begun_ns:
+            reported_um = abs(stage.to_um(report.steps) - begun_um)
+            commanded_um = plan.speed_um_s * ((report.earliest_ns - begun_ns) / 1e9 - plan.turn_s)
         limits = stage.parts.lens.limits
         edge_um = stage.to_um(limits.max_steps if plan.sign > 0 else limits.min_steps)
         return safety.Conditions(
@@ -118,6 +124,7 @@ class Sweep:
             ms_to_deadline=(plan.deadline_ns - now) / NS_PER_MS,
             camera_silent_ms=(now - heard_ns) / NS_PER_MS,
             travel_um=plan.sign * (here_um - begun_um),
+            commanded_travel_um=commanded_um,
             reported_travel_um=reported_um,
             max_travel_um=plan.max_travel_um,
             way_to_limit_um=plan.sign * (edge_um - here_um) - plan.braking_um,

@@ -105,9 +105,9 @@ class RunWriter:
             self.tape = TapeWriter(self.path, memory_limit_bytes=self._memory_limit_bytes, opener=opener)
 
     @classmethod
-    def begin(cls, config: Config, request: Any, parts: RigParts) -> Self:
-        """Open a run for *parts*; ``run.parts`` is the rig to use from here on."""
-        run = cls(config, request)
+    def begin(cls, config: Config, request: Any, parts: RigParts, **options: Any) -> Self:
+        """Open a run for *parts*; ``run.parts`` is the rig to use from here on. *options* as in the constructor."""
+        run = cls(config, request, **options)
         run.parts = parts if run.path is None else tape_rig(parts, run.tape)
         return run
 
@@ -248,7 +248,7 @@ def forget_old_runs(parent: Path, keep: int) -> list[Path]:
     runs = sorted(folder for folder in parent.iterdir() if is_run(folder) and _FOLDER_NAME.fullmatch(folder.name))
     old = runs[: max(0, len(runs) - keep)]
     for folder in old:
-        shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)  # another process may be at it too; the next run tries again
     return old
 
 

@@ -14,22 +14,21 @@ from __future__ import annotations
 import re
 import zipfile
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from elpd.errors import FormatError, UsageError
-from elpd.records import Encoding, Geometry, Roi
+from elpd.events.stream import EventStream, open_recording
+from elpd.records import Geometry, Roi
 from elpd.vision.reference import load_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from elpd.ports import RecordingFormat
 
 EVENTS_NAME = "event.npy"
 INFO_NAME = "info.txt"
@@ -132,10 +131,11 @@ def _read_info(info: Path) -> _Info:
 def _frames_in(folder: Path) -> tuple[FrameFile, ...]:
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder of frames; give --frames DIR relative to the sweep, or none")
-    found = []
-    for entry in folder.iterdir():
-        if entry.suffix.lower() in _FRAME_SUFFIXES and entry.stem.isdigit():
-            found.append(FrameFile(int(entry.stem), entry))
+    found = [
+        FrameFile(int(entry.stem), entry)
+        for entry in folder.iterdir()
+        if entry.suffix.lower() in _FRAME_SUFFIXES and entry.stem.isdigit()
+    ]
     if not found:
         raise FormatError(f"{folder}: no frames named <microseconds>.jpg or .png; give --frames none to do without")
     return tuple(sorted(found, key=lambda frame: frame.t_us))
@@ -147,11 +147,7 @@ def _read_events(path: Path) -> tuple[dict[str, NDArray[Any]], Geometry | None, 
         return _columns_of_npz(path), None, []
     if suffix == ".npy":
         return _columns_of_npy(path), None, []
-    for entry in sorted(entry_points(group="elpd.formats"), key=lambda one: one.name):
-        recording: RecordingFormat = entry.load()
-        if recording.recognises(path):
-            return _columns_of_recording(recording, path)
-    raise FormatError(f"{path}: not an event file that any installed format knows; `elpd check` lists the formats")
+    return _columns_of_recording(path)
 
 
 def _columns_of_npy(path: Path) -> dict[str, NDArray[Any]]:
@@ -197,22 +193,18 @@ def _columns_of_array(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]
     return {"t": array[:, 0], "x": array[:, 1], "y": array[:, 2], "p": array[:, 3]}
 
 
-def _columns_of_recording(
-    recording: RecordingFormat, path: Path
-) -> tuple[dict[str, NDArray[Any]], Geometry | None, list[str]]:
-    reader = recording.open(path)
-    pieces: list[dict[str, NDArray[Any]]] = []
+def _columns_of_recording(path: Path) -> tuple[dict[str, NDArray[Any]], Geometry | None, list[str]]:
+    reader = open_recording(path)
     try:
+        pieces = [
+            (chunk.t.copy(), chunk.x.copy(), chunk.y.copy(), chunk.p.copy()) for chunk in EventStream(reader).chunks()
+        ]
         geometry = reader.geometry
-        for packet in reader.packets():
-            if packet.encoding is not Encoding.ARRAY:
-                raise FormatError(f"{path}: {packet.encoding.value} words; this build reads sweeps from event arrays")
-            pieces.append({name: part.copy() for name, part in _columns_of_array(packet.data, path).items()})
         warnings = [str(one) for one in reader.notes.get("warnings", ())]
     finally:
         reader.close()
-    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in ("t", "x", "y", "p")} if pieces else {}
-    return columns, geometry, warnings
+    columns = zip(("t", "x", "y", "p"), zip(*pieces, strict=True), strict=True) if pieces else ()
+    return {name: np.concatenate(column) for name, column in columns}, geometry, warnings
 
 
 def _assemble(
@@ -241,7 +233,8 @@ def _assemble(
     outside = (x < 0) | (y < 0) | (x >= geometry.width) | (y >= geometry.height)
     if outside.any():
         raise FormatError(
-            f"{path}: {int(outside.sum())} of {x.size} events lie outside the sensor's {geometry.width}x{geometry.height}"
+            f"{path}: {int(outside.sum())} of {x.size} events lie outside "
+            f"the sensor's {geometry.width}x{geometry.height} pixels"
         )
     if (np.diff(t_us) < 0).any():
         order = np.argsort(t_us, kind="stable")
@@ -254,7 +247,9 @@ def _assemble(
         if chosen.fits(geometry):
             roi = chosen
         else:
-            notes.append(f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor; all of it used")
+            notes.append(
+                f"the region (y1, y2, x1, x2) = {region} of {INFO_NAME} does not fit the sensor, which is used whole"
+            )
     return RecordedSweep(
         t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), info.bin_us, tuple(notes)
     )

@@ -71,7 +71,8 @@ def _interval(
     while begin_us < stop_us:
         last_us = min(begin_us + detector.bin_us, stop_us)
         part = slice(
-            int(np.searchsorted(sweep.t_us, begin_us, side="left")), int(np.searchsorted(sweep.t_us, last_us, side="right"))
+            int(np.searchsorted(sweep.t_us, begin_us, side="left")),
+            int(np.searchsorted(sweep.t_us, last_us, side="right")),
         )
         value = elp_of_bin(sweep.x[part], sweep.y[part], sweep.on[part], table, constants, roi)
         if value is not None:

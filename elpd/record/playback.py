@@ -23,7 +23,7 @@ from elpd.record.tape import ARRAYS_FILE, TAPE_FILE, TAPE_FORMAT, digest
 from elpd.units import HostNs, SensorUs, Steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
@@ -121,6 +121,14 @@ class TapeReader:
             self._cancelled = bool(line["answer"])
             self._advance()
         return self._cancelled
+
+    def packets(self) -> Iterator[records.CameraPacket]:
+        """Yield every packet that is left, whatever else was asked in between."""
+        while self._next is not None:
+            line = self._next
+            if line["call"] == "camera.read" and line.get("answer") is not None:
+                yield self._packet(line["answer"])
+            self._advance()
 
     def remaining(self) -> int:
         """Read to the end; return how many recorded calls nobody asked for, not counting those that close devices."""

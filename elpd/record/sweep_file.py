@@ -15,21 +15,18 @@ import numpy as np
 
 from elpd.records import Direction, FocusEstimate, Outcome
 from elpd.vision.crossing import (
-    FLANK,
     ROI_MARGIN_PX,
-    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
-    EventStretch,
     Witness,
-    ask_events,
     frame_witness,
     fuse,
 )
 from elpd.vision.detector import Detector
 from elpd.vision.filters import PixelCap
+from elpd.vision.memory import MIN_EVENTS, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS, Meter, Windows, WindowsByEvents, WindowsByTravel
 from elpd.vision.reference import Reference, check_size, reference_from_frame
-from elpd.vision.track import EventEnergy, FrameEnergy, PeakTrack
+from elpd.vision.track import FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,10 +35,7 @@ if TYPE_CHECKING:
     from elpd.records import ElpSample, Roi
     from elpd.vision.ruler import Ruler
 
-MIN_EVENTS = 1_000
-"""Fewer events between the flank of the peak and now make no image worth a vertex (``facts/motion.md`` §4)."""
-
-_RISE_WITHOUT_FRAMES = 0.30
+_PIECE = 1 << 18
 _RETRY_EVERY = 4
 
 _PATIENT_DROP = 0.2
@@ -104,15 +98,13 @@ class SweepSearch:
         windows: Windows = WindowsByEvents.for_roi(roi)
         if self._depth_of_focus_um is not None:
             windows = WindowsByTravel(ruler, TRAVEL_PER_DEPTH_OF_FOCUS * self._depth_of_focus_um)
-        self._meter = Meter(roi, windows, self._begin_us, ruler)
+        cap = PixelCap(sweep.geometry.height, sweep.geometry.width)
+        self._meter = Meter(roi, windows, self._begin_us, ruler, cap)
         self._detector = Detector()
         self._frames = PeakTrack()
         self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX)
-        self._image_track = PeakTrack()
         self._first = int(np.searchsorted(sweep.t_us, self._begin_us, side="left"))
-        self._stretch = self._cut_out()
-        self._energy = EventEnergy(self._stretch.height, self._stretch.width, ROI_MARGIN_PX)
-        self._taken = 0
+        self._memory = EventMemory(roi, sweep.geometry)
         self._attempts_until = 0
         self._width: float | None = None
         self._doubtful: Detection | None = None
@@ -135,33 +127,21 @@ class SweepSearch:
         found = self._events(done, self._sweep.t_us.size, None)
         return found or self._ended()
 
-    def _cut_out(self) -> EventStretch:
-        """Return the events of the region and its margin. A pixel that fires too often is capped, causally."""
-        sweep, roi, geometry = self._sweep, self._roi, self._sweep.geometry
-        left, top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
-        right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
-        bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
-        x, y = sweep.x[self._first :], sweep.y[self._first :]
-        inside = (x >= left) & (x < right) & (y >= top) & (y < bottom)
-        t_us = sweep.t_us[self._first :][inside]
-        x, y = (x[inside] - left).astype(np.uint16), (y[inside] - top).astype(np.uint16)
-        on = sweep.on[self._first :][inside]
-        keep = PixelCap(bottom - top, right - left).keep(t_us, x, y)
-        t_us = t_us[keep]
-        return EventStretch(
-            t_us, x[keep], y[keep], on[keep], self._ruler.at(t_us), bottom - top, right - left, ROI_MARGIN_PX
-        )
-
     def _events(self, begin: int, end: int, complete_until_us: int | None) -> Detection | None:
+        """Show events ``begin .. end`` piece by piece; *complete_until_us* is the frame that comes after them."""
         sweep = self._sweep
-        part = slice(begin, end)
-        for sample in self._meter.feed(sweep.t_us[part], sweep.x[part], sweep.y[part], sweep.on[part], complete_until_us):
-            self._detector.feed(sample)
-            self._follow_image(sample)
-            if self._detector.samples >= self._attempts_until:
-                found = self._attempt(sample.end_us)
-                if found is not None:
-                    return self._closed_by(found, sample, complete_until_us)
+        for start in range(begin, max(end, begin + 1), _PIECE):
+            part = slice(start, min(start + _PIECE, end))
+            events = sweep.t_us[part], sweep.x[part], sweep.y[part], sweep.on[part]
+            self._memory.add(*events)
+            promise_us = complete_until_us if part.stop == end else None
+            for sample in self._meter.feed(*events, promise_us):
+                self._detector.feed(sample)
+                self._memory.advance(sample.end_us, self._ruler.position(sample.end_us))
+                if self._detector.samples >= self._attempts_until:
+                    found = self._attempt(sample.end_us)
+                    if found is not None:
+                        return self._closed_by(found, sample, complete_until_us)
         return None
 
     def _closed_by(self, found: Detection, sample: ElpSample, complete_until_us: int | None) -> Detection:
@@ -171,14 +151,6 @@ class SweepSearch:
         if complete_until_us is not None:
             closing = min(closing, complete_until_us)
         return replace(found, decided_us=closing)
-
-    def _follow_image(self, sample: ElpSample) -> None:
-        events = self._stretch
-        until = int(np.searchsorted(events.t_us, sample.end_us, side="left"))
-        part = slice(self._taken, until)
-        self._energy.add(events.x[part], events.y[part], events.on[part])
-        self._taken = until
-        self._image_track.add(sample.end_us, self._ruler.position(sample.end_us), self._energy.measure())
 
     def _frame(self, t_us: int, pixels: NDArray[np.generic]) -> Detection | None:
         check_size(pixels.shape, self._sweep.geometry, f"frame of {t_us} us")
@@ -211,9 +183,9 @@ class SweepSearch:
         elif not self._image_peak_passed():
             return None
         self._attempts_until = self._detector.samples + _RETRY_EVERY
-        said = self._ask_events(now_us)
-        if said is not None:
-            witnesses += said
+        brightness = None if self._reference is None else self._reference.brightness
+        said, self._width = self._memory.witnesses(now_us, self._ruler, brightness)
+        witnesses += said
         estimate = fuse(witnesses)
         if estimate is None:
             return None
@@ -221,53 +193,11 @@ class SweepSearch:
         return self._decide(estimate, limit, now_us)
 
     def _image_peak_passed(self) -> bool:
-        track = self._image_track
-        if not track.passed or track.rise < _RISE_WITHOUT_FRAMES:
+        """Whether the events' own image has peaked, and ELP says so too, unless the fall is beyond doubt."""
+        if not self._memory.peak_passed:
             return False
-        begin_us = track.times_us[track.flank(FLANK)]
-        events = self._stretch.t_us
-        count = self._taken - int(np.searchsorted(events, begin_us, side="left"))
-        return count >= MIN_EVENTS and (self._reference is None or self._detector.mutation is not None or track.drop > 0.2)
-
-    def _ask_events(self, now_us: int) -> list[Witness] | None:
-        track, ruler, all_events = self._image_track, self._ruler, self._stretch
-        stretch_begin_us, _, sign = ruler.stretch(now_us)
-        begin = int(np.searchsorted(all_events.t_us, stretch_begin_us, side="left"))
-        part = slice(begin, self._taken)
-        if self._taken - begin < MIN_EVENTS or sign == 0:
-            return None
-        flank_us = max(float(track.times_us[track.flank(FLANK)]), stretch_begin_us)
-        events = EventStretch(
-            all_events.t_us[part],
-            all_events.x[part],
-            all_events.y[part],
-            all_events.on[part],
-            sign * all_events.position[part],
-            all_events.height,
-            all_events.width,
-            all_events.margin,
-        )
-        peak_us = track.times_us[track.peak]
-        if peak_us <= flank_us:
-            return None
-        said = ask_events(
-            events,
-            sign * ruler.position(flank_us),
-            sign * ruler.position(peak_us),
-            sign * ruler.position(now_us),
-            self._brightness(),
-        )
-        self._width = said.vertex.width if said.vertex is not None else None
-        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
-        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)]
-
-    def _brightness(self) -> NDArray[np.float32] | None:
-        """Return the reference's brightness over the cut-out."""
-        if self._reference is None:
-            return None
-        roi, cut = self._roi, self._stretch
-        left, top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
-        return np.ascontiguousarray(self._reference.brightness[top : top + cut.height, left : left + cut.width])
+        agreed = self._reference is None or self._detector.mutation is not None
+        return agreed or self._memory.track.drop > _PATIENT_DROP
 
     def _width_of(self, witnesses: list[Witness]) -> float:
         frames = self._frames.vertex() if witnesses and witnesses[0].name == "frames" else None

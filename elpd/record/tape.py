@@ -258,7 +258,7 @@ class TapeWriter:
 
     def _packet(self, packet: CameraPacket) -> dict[str, Any]:
         stream, name = self._stream(packet.encoding, packet.data.dtype)
-        self._file(name).write(packet.data.tobytes())
+        self._file(name).write(_without_padding_noise(packet.data).tobytes())
         line: dict[str, Any] = {"stream": stream, "count": packet.data.size, "received_ns": packet.received_ns}
         line["complete_until_us"] = packet.complete_until_us
         if packet.frames:
@@ -306,7 +306,7 @@ class TapeWriter:
         self._frames += 1
         pixels = frame.pixels
         as_png = pixels.dtype in _PNG_TYPES and pixels.ndim == 2 and pixels.size > 0
-        name = f"frames/{self._frames:06d}.{'png' if as_png else 'npy'}"
+        name = frame_name(self._frames) if as_png else f"frames/{self._frames:06d}.npy"
         with self._open(name) as file:
             if as_png:
                 file.write(cv2.imencode(".png", pixels)[1].tobytes())
@@ -331,12 +331,28 @@ def tape_rig(parts: RigParts, tape: TapeWriter) -> RigParts:
     return replace(build_doubles(facts, tape), truth=parts.truth)
 
 
+def frame_name(number: int) -> str:
+    """Return where the frame that came as the *number*-th lies, in the run's folder."""
+    return f"frames/{number:06d}.png"
+
+
 def _owned(packet: CameraPacket) -> CameraPacket:
     """Copy the views of a packet, which end with the next read."""
     frames = packet.frames
     if frames:
         frames = tuple(replace(frame, pixels=np.ascontiguousarray(frame.pixels).copy()) for frame in frames)
     return replace(packet, data=packet.data.copy(), frames=frames)
+
+
+def _without_padding_noise(data: NDArray[Any]) -> NDArray[Any]:
+    """Return events whose bytes between the fields are zero; what stood there was whatever the memory held before."""
+    names = data.dtype.names
+    if names is None or data.dtype.itemsize == sum(data.dtype[name].itemsize for name in names):
+        return data
+    clean = np.zeros(data.shape, data.dtype)
+    for name in names:
+        clean[name] = data[name]
+    return clean
 
 
 def _raised(error: BaseException) -> _Raised:

@@ -35,9 +35,6 @@ MIN_TEXTURE = 0.5
 MIN_SIGNIFICANCE = 6.0
 """And least distance from noise alone in standard deviations; covers the search over a megapixel of positions."""
 
-HOLE_MARGIN_PX = 4
-"""How far around holes (3x3 pixels and more) the band-pass sees their rim instead of the scene."""
-
 MIN_USABLE_FRACTION = 0.5
 
 
@@ -124,9 +121,14 @@ def _energy_over_noise(
     log_intensity: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return per pixel the band's energy above noise, in units of the noise's, and where the pixel is usable (0, 1)."""
-    usable = _usable(valid)
-    fine = cv2.GaussianBlur(log_intensity, (0, 0), FINE_SIGMA_PX, borderType=cv2.BORDER_REFLECT_101)
-    coarse = cv2.GaussianBlur(log_intensity, (0, 0), COARSE_SIGMA_PX, borderType=cv2.BORDER_REFLECT_101)
+    usable = valid.astype(np.float32)
+    # Only valid pixels enter the means, so that neither a hole nor its filling makes an edge.
+    centre = np.float32(np.median(log_intensity[valid])) if valid.any() else np.float32(0)
+    weighted = np.where(valid, log_intensity - centre, np.float32(0))
+    fine, coarse = (
+        cv2.GaussianBlur(weighted, (0, 0), sigma_px) / np.maximum(cv2.GaussianBlur(usable, (0, 0), sigma_px), 1e-6)
+        for sigma_px in (FINE_SIGMA_PX, COARSE_SIGMA_PX)
+    )
     energy = np.square(fine - coarse)
     # White noise of unit variance through the difference of two Gaussians.
     gain = (
@@ -135,22 +137,11 @@ def _energy_over_noise(
         - 1 / (np.pi * (FINE_SIGMA_PX**2 + COARSE_SIGMA_PX**2))
     )
     # A picture without any noise is limited by its numbers: float32 keeps 24 bits.
-    resolution = float(np.abs(log_intensity).max()) * 2.0**-20 + 1e-12
+    resolution = (float(np.abs(log_intensity).max()) + 1e-12) * 2.0**-20
     noise = max(noise_sigma(log_intensity, valid), resolution) ** 2 * gain
-    if usable.any():
-        energy = np.minimum(energy, max(float(np.percentile(energy[usable], CAP_PERCENTILE)), 4 * noise))
-    excess = np.where(usable, energy / noise - 1.0, 0.0).astype(np.float32)
-    return excess, usable.astype(np.float32)
-
-
-def _usable(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leave out invalid pixels, and the surroundings of holes; a single mended pixel makes no rim."""
-    invalid = (~valid).astype(np.uint8)
-    holes = cv2.morphologyEx(invalid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    side = 2 * HOLE_MARGIN_PX + 1
-    rim = cv2.dilate(holes, np.ones((side, side), np.uint8)) > 0
-    usable: NDArray[np.bool_] = valid & ~rim
-    return usable
+    if valid.any():
+        energy = np.minimum(energy, max(float(np.percentile(energy[valid], CAP_PERCENTILE)), 4 * noise))
+    return np.where(valid, energy / noise - 1.0, 0.0).astype(np.float32), usable
 
 
 def _box_sums(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float64]:

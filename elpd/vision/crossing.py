@@ -1,11 +1,11 @@
 """Several witnesses, one focus position, one standard error.
 
-Mirror pairs, the vertex of the events' own image, the vertex of frames and the zero crossing of ELP each say where focus
-was. They fail for different reasons: pairs under scene motion, the events' vertex by the unanswered pixels at its end,
-frames by exposure, the crossing always late. So they are fused by their standard errors, which hold, beside the
-scatter, what is known to be systematic. Widths and errors are in units of the curve's own width (``Vertex.width``),
-a fifth of which is a depth of focus, so that nothing here depends on scene, optics or speed. Witnesses that disagree
-beyond their errors widen the answer's.
+Mirror pairs, the vertex of the events' own image and the vertex of frames each say where focus was. They fail for
+different reasons: pairs under scene motion, the events' vertex by pixels that have not answered yet, frames by
+exposure. So they are fused by their standard errors, which hold, beside scatter, what is known to be systematic.
+(The zero crossing of ELP is no witness: it is late by the sensor's hysteresis, differently in every scene.) Widths and
+errors are in units of the curve's own width (``Vertex.width``), a fifth of which is a depth of focus, so that nothing
+here depends on scene, optics or speed. Witnesses that disagree beyond their errors widen the answer's.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ SYSTEMATIC_VERTEX = 0.06
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
+VERTEX_IN_MOTION = 0.12
+"""What scene motion adds to the vertex' error, where it strays all pairs."""
+
 LAG_UNEXPLAINED = 0.5
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
 
@@ -57,6 +60,9 @@ UNANSWERED = 0.23
 TICKS = 64
 FLANK = 0.6
 ROI_MARGIN_PX = 14
+
+NARROWEST = 0.4
+"""Width of a vertex over that of the hill it stands on, below which it is a ripple."""
 
 DARK = 0.04
 """Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (ten of 255 grey levels)."""
@@ -110,6 +116,7 @@ class Lag:
     sigma: float = 0.0
     typical: float = 0.0
 
+
 @dataclass(frozen=True, slots=True)
 class EventWitnesses:
     """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
@@ -118,23 +125,29 @@ class EventWitnesses:
     pairs: Mode | None
     lag: Lag
 
-    def witnesses(self, unmeasured_lag: float) -> list[Witness]:
+    def witnesses(
+        self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
+    ) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
 
-        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured.
+        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured, *unexplained* the
+        share of a measured one that may be wrong. *width* is the curve's own, where it is known beforehand; without
+        it, pairs are believed only beside a vertex.
         """
-        found = []
-        if self.vertex is None:
+        found: list[Witness] = []
+        if self.vertex is None and width is None:
             return found
-        width = self.vertex.width
+        width = width if width is not None or self.vertex is None else self.vertex.width
+        assert width is not None
         shared = unmeasured_lag
         if self.lag.sigma > 0.0:
-            shared = self.lag.typical * float(np.hypot(LAG_UNEXPLAINED * self.lag.at, self.lag.sigma))
-        sigma = float(np.hypot(self.vertex.sigma, SYSTEMATIC_VERTEX * width))
-        found.append(Witness("vertex", self.vertex.at, sigma, shared))
+            shared = self.lag.typical * float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
+        # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
+        stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
+        if self.vertex is not None:
+            sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
+            found.append(Witness("vertex", self.vertex.at, sigma, shared))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
-            # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
-            stray = max(0.0, _STATIC_SHARE - self.pairs.share)
             sigma = float(np.hypot(self.pairs.sigma, (SYSTEMATIC_PAIRS + stray) * width))
             found.append(Witness("pairs", self.pairs.at, sigma, shared))
         return found
@@ -183,6 +196,9 @@ def _vertex(
         if int(use.sum()) >= 5:
             vertex = fit_vertex(ticks[use], curve[use], 0.7 * wide.width)
     if vertex is not None and vertex.at > end - (UNANSWERED + 0.2) * vertex.width:
+        vertex = None
+    # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
+    if vertex is not None and vertex.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
         vertex = None
     return vertex, level_at_peak
 

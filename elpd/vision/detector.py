@@ -8,7 +8,7 @@ deviations, whatever the region, the contrast, the window or the sensor.
 The running sum C of samples rises while focus is ahead and falls once it is behind. A verdict is a rally from its
 running minimum or a drawdown from its running maximum that is six deviations long: the first such is the direction,
 a drawdown after a rally is the sign mutation that the paper looks for, and a rally after a drawdown says that the
-scene has moved focus ahead again. The change itself is dated to the maximum of C, which is where ELP crosses zero. That is
+scene has moved focus ahead again. The change itself is dated to the maximum of C, where ELP crosses zero. That is
 *late* by the sensor's hysteresis; ``crossing`` says where focus was.
 """
 
@@ -61,10 +61,15 @@ class Detector:
         What the region says at rest; its mean is subtracted.
     arm_after_us:
         Samples that begin earlier are settling, and are not judged.
+    recede_sigmas:
+        How certain a first verdict of receding must be: more after a reversal, because a false one costs the most.
     """
 
-    def __init__(self, rest: RestingRate | None = None, arm_after_us: int = 0) -> None:
+    def __init__(
+        self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS
+    ) -> None:
         self.rest = rest or RestingRate()
+        self.recede_sigmas = recede_sigmas
         self.arm_after_us = arm_after_us
         self.direction = Direction.UNKNOWN
         self.first: Verdict | None = None
@@ -92,7 +97,7 @@ class Detector:
 
     @property
     def likely_crossing_us(self) -> int | None:
-        """When ELP crossed zero: at the mutation, or so far as is known before one is certain; ``None`` if it has not."""
+        """When ELP crossed zero: at the mutation, or what is likely before one is certain; ``None`` if it has not."""
         if self.direction is Direction.APPROACHING and self._total < self._high:
             return self._high_us
         return self.crossing_us
@@ -163,12 +168,15 @@ class Detector:
             self._turn(Direction.APPROACHING, sample, self.approach_score)
             self._foot = self._low
             self._high, self._high_us = self._total, sample.end_us
-            self._at_high = (0.5 * (sample.begin_us + sample.end_us), sample.elp / max(1, sample.end_us - sample.begin_us))
+            self._at_high = (
+                0.5 * (sample.begin_us + sample.end_us),
+                sample.elp / max(1, sample.end_us - sample.begin_us),
+            )
             self._energy_since_high, self._events_since_high = 0.0, 0
         elif (
             self.direction is not Direction.RECEDING
             and self._events_since_high >= _MIN_EVENTS_FOR_VERDICT
-            and self.recede_score > SIGMAS
+            and self.recede_score > (self.recede_sigmas if self.direction is Direction.UNKNOWN else SIGMAS)
             and (self.direction is Direction.UNKNOWN or drawdown > RELATIVE_DRAWDOWN * (self._high - self._foot))
         ):
             score = self.recede_score

@@ -144,6 +144,16 @@ class ElpWindows:
             )
         self._append(edges)
 
+    def set_weights(self, weights: NDArray[Any], inside: NDArray[np.bool_] | None = None) -> None:
+        """Weigh events by another reference from now on; the open window goes on.
+
+        Raises ``UsageError`` as the constructor does, and for a sensor of another size.
+        """
+        table = weight_table(weights, inside)
+        if table.shape != self._table.shape:
+            raise UsageError(f"the new weights of {weights.shape} are for another sensor; make a new ElpWindows")
+        self._table = table
+
     def feed(self, packet: CameraPacket) -> NDArray[Any]:
         """Sum a packet; return the windows it closed.
 

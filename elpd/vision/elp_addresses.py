@@ -7,7 +7,7 @@ and events may come in any order. Arrays are read where they lie, in whatever la
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from elpd.events.evt2 import (
     take_time_high,
 )
 from elpd.events.jit import kernel
-from elpd.events.registers import BEFORE_TIME, HIGH, LOOP, LOW, MAX_SIDE
+from elpd.events.registers import BEFORE_TIME, HIGH, LOOP, LOW, MAX_SIDE, Integer
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import (
     BEGIN,
@@ -56,10 +56,10 @@ ARRAYS_SIGNATURES = tuple(
 
 @kernel()
 def add_event(
-    t: int,
-    x: int,
-    y: int,
-    on: int,
+    t: Integer,
+    x: Integer,
+    y: Integer,
+    on: Integer,
     capped: bool,  # noqa: FBT001  (a constant of the caller)
     table: NDArray[np.int16],
     window: NDArray[np.int64],
@@ -106,7 +106,7 @@ def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compi
         outside = 0
         out_of_sensor = 0
         last_row = table.shape[0] // STRIDE - 1
-        t = np.int64(NEVER)
+        t: Any = np.int64(NEVER)
         while position < ts.shape[0]:
             t = np.int64(ts[position])
             if np.uint64(t - begin) >= length:
@@ -148,6 +148,33 @@ def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compi
     return arrays_to_windows
 
 
+@kernel()
+def reach(
+    state: NDArray[np.int64], window: NDArray[np.int64], edges: NDArray[np.int64], rows: NDArray[np.int64]
+) -> bool:
+    """Let the time of the registers close windows; say whether to go on."""
+    t = (((state[LOOP] << HIGH_BITS) + state[HIGH]) << LOW_BITS) + state[LOW]
+    if np.uint64(t - window[BEGIN]) < np.uint64(window[LENGTH]):
+        return True
+    return bool(move_to(t, window, edges, rows))
+
+
+@kernel()
+def finish(
+    state: NDArray[np.int64],
+    window: NDArray[np.int64],
+    edges: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    complete_until_us: int,
+) -> None:
+    """Settle the count of late events and close what the caller's promise closes."""
+    t: Any = np.int64(NEVER)
+    if state[HIGH] >= 0:
+        t = (((state[LOOP] << HIGH_BITS) + state[HIGH]) << LOW_BITS) + state[LOW]
+    if max(t, complete_until_us) > NEVER:
+        move_to(max(t, complete_until_us), window, edges, rows)
+
+
 def _build_evt2(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
     @kernel(f"int64({EVT2_WORDS}, int64, int64[::1], int64[:, ::1], {_WINDOWS})")
     def evt2_to_windows(
@@ -168,6 +195,8 @@ def _build_evt2(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile
             kind = word >> 28
             if kind == 0x8:
                 take_time_high(word & 0xFFFFFFF, state)
+                if not reach(state, window, edges, rows):
+                    return position
             elif state[HIGH] < 0:
                 state[BEFORE_TIME] += 1
             else:
@@ -209,6 +238,8 @@ def _build_evt21(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compil
             kind = upper >> 28
             if kind == 0x8:
                 take_time_high(upper & 0xFFFFFFF, state)
+                if not reach(state, window, edges, rows):
+                    return position
             elif state[HIGH] < 0:
                 state[BEFORE_TIME] += 1
             else:
@@ -230,22 +261,6 @@ def _build_evt21(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compil
         return position
 
     return evt21_to_windows
-
-
-@kernel()
-def finish(
-    state: NDArray[np.int64],
-    window: NDArray[np.int64],
-    edges: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    complete_until_us: int,
-) -> None:
-    """Settle the count of late events and close what the caller's promise closes."""
-    if state[HIGH] >= 0:
-        t = (((state[LOOP] << HIGH_BITS) + state[HIGH]) << LOW_BITS) + state[LOW]
-        complete_until_us = max(t, complete_until_us)
-    if complete_until_us > NEVER:
-        move_to(complete_until_us, window, edges, rows)
 
 
 arrays_to_windows = _build_arrays(capped=False)

@@ -22,6 +22,8 @@ from elpd.events.jit import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from elpd.events.registers import Integer
+
 ELP, ENERGY, N_ON, N_OFF, N_CAPPED = 0, 1, 2, 3, 4
 CURSOR = 5  # the open window begins at edges[CURSOR]; -1 before the first edge
 N_EDGES, N_ROWS = 6, 7
@@ -44,11 +46,12 @@ def new_window() -> NDArray[np.int64]:
     window = np.zeros(WINDOW_SIZE, np.int64)
     window[CURSOR] = -1
     window[LATE_MARK] = -1
+    window[NOW] = NEVER
     return window
 
 
 @kernel("boolean(int64, int64[::1], int64[::1], int64[:, ::1])")
-def move_to(t: int, window: NDArray[np.int64], edges: NDArray[np.int64], rows: NDArray[np.int64]) -> bool:
+def move_to(t: Integer, window: NDArray[np.int64], edges: NDArray[np.int64], rows: NDArray[np.int64]) -> bool:
     """Close every window that ends at or before *t*; say whether events at *t* may be summed now.
 
     ``False`` means paused: no row left, or no edge after *t* is known and the caller wants to append some.

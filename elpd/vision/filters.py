@@ -21,7 +21,16 @@ CAP_DECAY_US = 5_000
 
 
 @kernel("int64(int64[::1], uint16[::1], uint16[::1], int64[:, ::1], int64[:, ::1], int64, int64, uint8[::1])")
-def cap_pixels(t_us, x, y, credit_us, last_us, burst, decay_us, keep):  # type: ignore[no-untyped-def]
+def cap_pixels(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    credit_us: NDArray[np.int64],
+    last_us: NDArray[np.int64],
+    burst: int,
+    decay_us: int,
+    keep: NDArray[np.uint8],
+) -> int:
     """Mark in *keep* the events that a leaky bucket per pixel lets through; return how many it refused.
 
     The bucket holds ``burst · decay_us / burst`` microseconds of debt: each event adds ``decay_us // burst``, each
@@ -36,8 +45,7 @@ def cap_pixels(t_us, x, y, credit_us, last_us, burst, decay_us, keep):  # type: 
         row = y[i]
         column = x[i]
         debt = credit_us[row, column] - (t_us[i] - last_us[row, column])
-        if debt < 0:
-            debt = 0
+        debt = max(debt, 0)
         last_us[row, column] = t_us[i]
         if debt + price > decay_us:
             credit_us[row, column] = debt

@@ -52,14 +52,27 @@ def band_gain(scale_px: float) -> float:
 
 
 @kernel("void(uint16[::1], uint16[::1], uint8[::1], int32[:, ::1])")
-def add_events(x, y, on, level):  # type: ignore[no-untyped-def]
+def add_events(
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    level: NDArray[np.int32],
+) -> None:
     """Add ±1 per event to *level*, (height, width), in place."""
     for i in range(x.size):
         level[y[i], x[i]] += 2 * np.int32(on[i]) - 1
 
 
 @kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
-def rebuild_levels(starts, order, position, on, ticks, level, squares):  # type: ignore[no-untyped-def]
+def rebuild_levels(
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    position: NDArray[np.float64],
+    on: NDArray[np.uint8],
+    ticks: NDArray[np.float64],
+    level: NDArray[np.float32],
+    squares: NDArray[np.float64],
+) -> None:
     """Rebuild each pixel's level at each tick from its events, without the hysteresis of the sensor.
 
     Parameters

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Roi
+    from elpd.vision.filters import PixelCap
     from elpd.vision.reference import Reference
     from elpd.vision.ruler import Ruler
 
@@ -39,7 +40,19 @@ LONGEST_WINDOW_US = 1_000_000
     "void(int64[::1], uint16[::1], uint16[::1], uint8[::1], int16[:, ::1], int64, int64, int64, int64, "
     "int64[::1], int64[:, ::1])"
 )
-def sum_windows(t_us, x, y, on, weights, x0, y0, x1, y1, edges_us, sums):  # type: ignore[no-untyped-def]
+def sum_windows(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    weights: NDArray[np.int16],
+    x0: int,
+    y0: int,
+    x1: int,
+    y1: int,
+    edges_us: NDArray[np.int64],
+    sums: NDArray[np.int64],
+) -> None:
     """Add events to the windows between ascending *edges_us*; those outside edges or region are passed over.
 
     *sums*, (windows, 4) ``int64``, is added to: elp, energy, ON count, OFF count.
@@ -123,6 +136,7 @@ class WindowsByEvents:
     def edge_after(self, begin_us: int) -> int | None:
         """Return nothing: events decide."""
         del begin_us
+        return None
 
     @classmethod
     def for_roi(cls, roi: Roi) -> WindowsByEvents:
@@ -143,9 +157,15 @@ class Meter:
         Where the lens was, for the samples' positions; may be absent.
     begin_us:
         Start of the first window; earlier events are passed over.
+    cap:
+        Silences pixels that fire too often; may be absent.
     """
 
-    def __init__(self, roi: Roi, windows: Windows, begin_us: int, ruler: Ruler | None = None) -> None:
+    def __init__(
+        self, roi: Roi, windows: Windows, begin_us: int, ruler: Ruler | None = None, cap: PixelCap | None = None
+    ) -> None:
+        self._cap = cap
+        self._refused_us = np.empty(0, dtype=np.int64)
         self.roi = roi
         self.windows = windows
         self.ruler = ruler
@@ -179,6 +199,7 @@ class Meter:
         if weights is None:
             weights = np.zeros((self.roi.y + self.roi.height, self.roi.x + self.roi.width), dtype=np.int16)
         known_until = max(int(t_us[-1]) if t_us.size else self._last_us, complete_until_us or self._last_us)
+        t_us, x, y, on = self._capped(t_us, x, y, on)
         samples: list[ElpSample] = []
         index = 0
         while True:
@@ -192,6 +213,15 @@ class Meter:
             index = until
         self._last_us = known_until
         return samples
+
+    def _capped(
+        self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
+        if self._cap is None:
+            return t_us, x, y, on
+        keep = self._cap.keep(t_us, x, y)
+        self._refused_us = np.concatenate([self._refused_us, t_us[~keep & self._inside(x, y)]])
+        return t_us[keep], x[keep], y[keep], on[keep]
 
     def _next_edge(
         self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], index: int
@@ -237,8 +267,10 @@ class Meter:
         if self.ruler is not None and self.ruler.in_um:
             position = self.ruler.position(0.5 * (self._begin_us + end_us))
             travel = abs(self.ruler.position(end_us) - self.ruler.position(self._begin_us))
+        n_capped = int(np.searchsorted(self._refused_us, end_us, side="left"))
+        self._refused_us = self._refused_us[n_capped:]
         sample = ElpSample(
-            SensorUs(self._begin_us), SensorUs(end_us), elp, energy, n_on, n_off, 0, position, travel
+            SensorUs(self._begin_us), SensorUs(end_us), elp, energy, n_on, n_off, n_capped, position, travel
         )
         self._begin_us = end_us
         self._sums[:] = 0

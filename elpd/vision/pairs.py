@@ -8,7 +8,8 @@ of the *lens positions* at t0 and t2, for any contrast, threshold, texture or bl
 contrast-dependent amount.
 
 Many pixels also turn for other reasons (noise, an edge sweeping over them), so pairs are gated by sign and time and
-combined by their weighted *mode*, not their mean. Scene motion makes mirrors of its own: never use pairs alone in motion.
+combined by their weighted *mode*, not their mean. Scene motion makes mirrors of its own: pairs alone are not to be
+trusted in motion.
 """
 
 from __future__ import annotations
@@ -28,7 +29,21 @@ if TYPE_CHECKING:
     "int64(int64[::1], uint16[::1], uint16[::1], uint8[::1], float64[::1], int64[:, :, ::1], float64[:, :, ::1], "
     "float64[::1], float64[::1], int64[::1], uint16[::1], uint16[::1], uint8[::1])"
 )
-def mirror_pairs(t_us, x, y, on, position, run, memory, before, after, after_us, pair_x, pair_y, pair_on):  # type: ignore[no-untyped-def]
+def mirror_pairs(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    on: NDArray[np.uint8],
+    position: NDArray[np.float64],
+    run: NDArray[np.int64],
+    memory: NDArray[np.float64],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    after_us: NDArray[np.int64],
+    pair_x: NDArray[np.uint16],
+    pair_y: NDArray[np.uint16],
+    pair_on: NDArray[np.uint8],
+) -> int:
     """Find the mirror pairs of an event stream; return how many were written to the output arrays.
 
     Parameters

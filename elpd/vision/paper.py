@@ -1,16 +1,16 @@
 """The published method, as its authors' released code really behaves, for comparison.
 
-Bao et al., "One-Step Event-Driven High-Speed Autofocus" (CVPR 2025), and the repository YuHanBaozju/ELP. Where text and
-code differ, the code is followed, because its numbers are the published ones (``facts/algorithms.md`` §1); what the text
-says instead is ``filter_of_the_paper``. In particular
+Bao et al., "One-Step Event-Driven High-Speed Autofocus" (CVPR 2025), and the repository YuHanBaozju/ELP. Where text
+and code differ, the code is followed, because its numbers are the published ones; what the text says
+instead is ``filter_of_the_paper``. In particular
 
-- the reference is a 3x3 median of the 8-bit frame under the 4-neighbour Laplacian, on the whole frame, then cut to the ROI;
+- the reference is a 3x3 median of the 8-bit frame under the 4-neighbour Laplacian, cut to the ROI;
 - bins are closed at both ends (an event on an edge counts twice), restart at each frame, and count events per pixel in
   eight bits, which wrap;
 - synthetic and DAVIS bins are divided by their number of events, those outside the ROI included; EVK4's are raw sums;
 - the filter's threshold of 5·10⁴ is out of reach of normalised values, which leaves an exponential mean of 0.4;
-- a fixed threshold per data set triggers; the answer is then *looked back for* at the last sign change and moved earlier
-  by a constant tuned per data set;
+- a fixed threshold per data set triggers; the answer is then *looked back for* at the last sign change and moved
+  earlier by a constant tuned per data set;
 - in the synthetic set it may be overwritten until the next frame, in the EVK4 set until the recording ends: hindsight.
 
 So ``decided_us`` of this method is when the answer was last written, which is honest, and long after ``focus_us``.
@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+from elpd.vision.reference import full_scale
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -84,7 +86,7 @@ def paper_laplacian(pixels: NDArray[np.generic], roi: Roi) -> NDArray[np.float32
     """Return the weight table of the released code: (height, width), zero outside the ROI."""
     image = np.asarray(pixels)
     if image.dtype != np.uint8:
-        top = float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else 1.0
+        top = full_scale(image) or 1.0
         image = np.clip(np.rint(image.astype(np.float64) * (255.0 / top)), 0, 255).astype(np.uint8)
     filtered = cv2.Laplacian(cv2.medianBlur(np.ascontiguousarray(image), 3), cv2.CV_32F)
     table = np.zeros(filtered.shape, dtype=np.float32)

@@ -17,7 +17,6 @@ A picture without structure above its own noise is refused before anything moves
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -26,6 +25,8 @@ import numpy as np
 from elpd.errors import FormatError, UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, TemporalImage
@@ -37,6 +38,9 @@ _SCALES_PX = (1.0, 1.5, 2.2, 3.3, 5.0)
 _CLIP_PERCENTILE = 99.0
 _SIGNAL_TO_NOISE = 4.0
 _SHARE_OF_STRUCTURE = 0.5
+_COARSER = 3
+"""Steps from the finest scale that has structure to the one that is still there far from focus: 3.3 times coarser."""
+
 _TEXTURE_SIGMAS = 6.0
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 
@@ -56,12 +60,16 @@ class Reference:
     brightness:
         Linear intensity relative to the brightest parts of the ROI, (height, width) ``float32``: how fast a pixel's
         photoreceptor is, and how much its events are worth when energies are summed.
+    fine:
+        As ``weights``, from the finest scale that stands out of the noise alone: the first to see that focus has been
+        passed, but not to be trusted with the direction from far away.
     """
 
     weights: NDArray[np.int16]
     texture: float
     scale_px: float
     brightness: NDArray[np.float32]
+    fine: NDArray[np.int16]
 
     @property
     def textured(self) -> bool:
@@ -84,9 +92,9 @@ def reference_from_frame(pixels: NDArray[np.generic], roi: Roi, *, mask: NDArray
     image = np.ascontiguousarray(pixels, dtype=np.float32)
     if image.ndim != 2:
         raise UsageError(f"a reference is a grey image of two dimensions; this one has shape {image.shape}")
-    top = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else float("inf")
+    top = full_scale(pixels) or float("inf")
     valid = (image < top) if mask is None else (mask & (image < top))
-    step = _QUANTISATION_VARIANCE if np.issubdtype(pixels.dtype, np.integer) else 0.0
+    step = _QUANTISATION_VARIANCE if full_scale(pixels) else 0.0
     ground = max(float(image.mean()) * 0.02, 1.0 if step else 1e-6)
     return _build(image, ground, roi, valid, step)
 
@@ -107,6 +115,11 @@ def load_image(path: Path) -> NDArray[np.generic]:
     if image is None:
         raise FormatError(f"{path}: {data.size} bytes that are no image; PNG, JPEG, TIFF and PGM are read")
     return np.asarray(image)
+
+
+def full_scale(pixels: NDArray[np.generic]) -> float | None:
+    """Return the largest value that integer pixels can have; ``None`` for floats."""
+    return None if pixels.dtype.kind == "f" else float(2 ** (8 * pixels.dtype.itemsize) - 1)
 
 
 def check_size(shape: tuple[int, ...], geometry: Geometry, name: str) -> None:
@@ -142,10 +155,21 @@ def _build(
     best = int(np.argmax(structure >= _SHARE_OF_STRUCTURE * structure.max())) if structure.max() > 0.0 else -1
     chosen, response = _SCALES_PX[best], responses[best]
     brightness = _relative_brightness(filled, ground, usable)
+    coarse = responses[min(best + _COARSER, len(responses) - 1)] if best >= 0 else response
     if ground is not None:
-        response = response / (cv2.GaussianBlur(filled, (0, 0), 2.0 * chosen) + np.float32(ground))
-    weights = _quantise(response, usable)
-    return Reference(weights, float(texture), chosen, brightness)
+        local = cv2.GaussianBlur(filled, (0, 0), 2.0 * chosen) + np.float32(ground)
+        response, coarse = response / local, coarse / local
+    # Near focus events follow the fine structure; far from it only the coarse is left of the picture.
+    weights = _quantise(_unit(response, usable) + _unit(coarse, usable), usable)
+    finest = responses[int(np.argmax(structure > 0.0))]
+    if ground is not None:
+        finest = finest / local
+    return Reference(weights, float(texture), chosen, brightness, _quantise(finest, usable))
+
+
+def _unit(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    spread = float(np.sqrt(np.mean(np.square(response[usable], dtype=np.float64)))) if usable.any() else 0.0
+    return np.asarray(response / np.float32(spread), dtype=np.float32) if spread > 0.0 else response
 
 
 def _quantise(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.int16]:
@@ -187,7 +211,7 @@ def _noise_gain(scale_px: float) -> float:
 
 
 def _white_noise_variance(image: NDArray[np.float32]) -> float:
-    """Estimate noise from what no blurred picture contains (Immerkaer 1996), by the median, so that edges do not count."""
+    """Estimate noise from what no blurred picture contains (Immerkaer 1996), by the median, which edges do not move."""
     if min(image.shape) < 3:
         return 0.0
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)

@@ -132,9 +132,10 @@ def find_opening(first: FirstTimes) -> SensorUs:
     *Jitter* tells how long before that the light began: threshold mismatch and photon noise act on intensity, thus
     scatter a pixel's time in proportion to the time *since the opening*. A straight line through the scatter of the
     brighter half of the picture over its time crosses zero at the opening (within 20 us in simulated openings with
-    mismatch alone; additive timing noise draws it early, which flattens the bright end a little, while a late one
-    would make it explode). The result lies inside the interval, and not further before the earliest agreement than
-    the time in which half of the picture fired. Use the aperture driver's own time wherever there is one.
+    mismatch alone). A pixel's lag moves the crossing as it moves the events, which is as it should be: what counts is
+    the time since *this pixel* could see the opening. Additive timing noise draws it early, which flattens the bright
+    end a little, where a late one would make it explode. The result lies inside the interval, and at most three times
+    as long before the earliest agreement as the brighter half of the picture took to fire after it.
 
     Raises
     ------
@@ -151,11 +152,14 @@ def find_opening(first: FirstTimes) -> SensorUs:
     earliest_us = float(fired_us.min())
     half_us = float(np.median(fired_us))
     opening_us = min(_jitter_vanishes_us(first, agreed_us, half_us), earliest_us - TIMESTAMP_STEP_US)
-    opening_us = max(opening_us, 2 * earliest_us - half_us, 0.0)
+    opening_us = max(opening_us, earliest_us - REACH * (half_us - earliest_us), 0.0)
     return SensorUs(first.begin_us + round(opening_us))
 
 
 JITTER_BINS = 16
+
+REACH = 3.0
+"""How far a line is trusted beyond the data, in lengths of the data."""
 
 
 def _jitter_vanishes_us(first: FirstTimes, agreed_us: NDArray[np.float32], until_us: float) -> float:
@@ -214,8 +218,8 @@ def temporal_image(
     valid = fired & (since_open_us > 0) & (passed > 0)
     if not valid.any():
         raise UsageError(
-            f"no pixel fired after the aperture began to open at {open_us} us "
-            f"({100 * first.fired_fraction:.2f} % fired before, which is noise); check the opening time and the profile"
+            f"no pixel fired together with its neighbours after the aperture began to open at {open_us} us; "
+            f"{100 * first.fired_fraction:.2f} % fired at all, which is noise; check the opening time and the profile"
         )
     log_intensity = np.zeros(first.times_us.shape, np.float32)
     log_intensity[valid] = -np.log(passed[valid])
@@ -263,7 +267,8 @@ def smoothed(image: TemporalImage) -> NDArray[np.float32]:
     """Return the log image through a 3x3 median: (height, width) float32.
 
     First-ON times scatter by 4 to 5 % from pixel to pixel (threshold mismatch, photon noise), white in space, which a
-    Laplacian amplifies most. The median takes off two thirds of it and leaves edges where they are.
+    Laplacian amplifies most. The median leaves 0.4 of it and straight edges where they are; it does cost detail of a
+    pixel's size, so a region of interest is better chosen on the unsmoothed picture.
     """
     median: NDArray[np.float32] = cv2.medianBlur(image.log_intensity, 3)
     return median

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from elpd.vision.integral import BANDS_PX, Vertex, add_events, band_energy, fit_vertex
+from elpd.vision.reference import full_scale
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,12 +73,17 @@ class PeakTrack:
 
     @property
     def scatter(self) -> float:
-        """One standard deviation of a point about its neighbours' line, from second differences near the peak."""
-        near = np.array(self.values[max(0, self._peak - 8) :])
-        if near.size < 5:
+        """One standard deviation of the curve about a smooth one, at the scale of its own peak.
+
+        From second differences of up to 32 averages between the flank and now: neighbouring points share most of
+        their error, so their own differences would flatter them.
+        """
+        values = np.array(self.values[self.flank(1.0) :])
+        if values.size < 6:
             return 0.0
-        second = np.diff(near, 2)
-        return float(np.median(np.abs(second - np.median(second)))) / 0.6745 / np.sqrt(6.0)
+        means = np.array([part.mean() for part in np.array_split(values, min(32, values.size))])
+        second = np.diff(means, 2)
+        return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6.0))
 
     @property
     def passed(self) -> bool:
@@ -126,7 +132,7 @@ class FrameEnergy:
         roi, margin = self._roi, self._margin
         top, left = max(0, roi.y - margin), max(0, roi.x - margin)
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
-        scale = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
+        scale = full_scale(pixels) or 1.0
         image = part.astype(np.float32) / np.float32(scale)
         if self._weight is None:
             smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(1e-6)
@@ -151,4 +157,6 @@ class EventEnergy:
 
     def measure(self) -> float:
         """Return log S now."""
-        return float(np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR))
+        return float(
+            np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR)
+        )

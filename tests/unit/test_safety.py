@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from elpd.focus.safety import Action, Conditions, Verdict, decide
 from elpd.records import Outcome
 
-CALM = Conditions(travel_um=60.0, reported_travel_um=58.0, events=10_000)
+CALM = Conditions(travel_um=60.0, commanded_travel_um=60.0, reported_travel_um=58.0, events=10_000)
 
 
 def test_a_calm_sweep_goes_on() -> None:
@@ -48,7 +48,7 @@ def test_noise_alone_is_not_a_scene() -> None:
 
 
 def test_a_lens_that_has_hardly_begun_is_not_yet_stuck() -> None:
-    assert decide(replace(CALM, travel_um=10.0, reported_travel_um=0.0)).action is Action.CONTINUE
+    assert decide(replace(CALM, commanded_travel_um=10.0, reported_travel_um=0.0)).action is Action.CONTINUE
 
 
 @given(

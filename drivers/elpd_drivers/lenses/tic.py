@@ -22,7 +22,9 @@ from elpd.errors import LensError
 from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
+from elpd_drivers.lenses import tic_wire as wire
 from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, read_settings, run_target
+from elpd_drivers.lenses.tic_wire import crc7, encode, long_word, parse_reply, reply_length
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,26 +32,6 @@ if TYPE_CHECKING:
     from elpd.ports import BytePort, Clock
     from elpd.records import LensLimits, PositionEstimate
     from elpd.units import Steps
-
-HALT_AND_HOLD, ENERGIZE, DEENERGIZE, EXIT_SAFE_START, RESET_TIMEOUT = 0x89, 0x85, 0x86, 0x83, 0x8C
-GO_HOME, GET_VARIABLE = 0x97, 0xA1
-SET_TARGET_POSITION, SET_TARGET_VELOCITY, HALT_AND_SET_POSITION = 0xE0, 0xE3, 0xEC
-SET_MAX_SPEED, SET_STARTING_SPEED, SET_MAX_DECELERATION, SET_MAX_ACCELERATION = 0xE6, 0xE5, 0xE9, 0xEA
-
-_ENERGIZED, _UNCERTAIN, _FORWARD_LIMIT, _REVERSE_LIMIT, _HOMING = 1, 2, 4, 8, 16
-_ERROR_WORDS = {
-    0x01: "de-energized",
-    0x02: "motor driver error",
-    0x04: "supply voltage low",
-    0x08: "kill switch active",
-    0x10: "required input invalid",
-    0x20: "serial error",
-    0x40: "command timeout",
-    0x80: "safe start violation",
-    0x100: "ERR line high",
-}
-_RECOVERABLE = 0x20 | 0x40 | 0x80
-_OPERATION_STATES = frozenset({0, 2, 4, 6, 8, 10})
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,30 +59,6 @@ class TicSettings:
     watchdog_ms: float = 1000.0
     latency_us: float = 100.0
     latency_sigma_us: float = 30.0
-
-
-def crc7(data: bytes) -> int:
-    """Return the CRC-7 of Pololu's serial protocols (polynomial 0x91, least significant bit first; guide §9)."""
-    crc = 0
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc ^ 0x91) >> 1 if crc & 1 else crc >> 1
-    return crc
-
-
-def encode(command: int, data: bytes = b"", *, device_number: int | None = None, crc: bool = False) -> bytes:
-    """Frame a command: compact, or Pololu's with a device number; with a CRC byte where asked for."""
-    frame = bytes((command,)) if device_number is None else bytes((0xAA, device_number & 0x7F, command & 0x7F))
-    frame += data
-    return frame + bytes((crc7(frame),)) if crc else frame
-
-
-def long_word(value: int) -> bytes:
-    """Return the five data bytes of a signed 32-bit value: the four top bits together, then seven bits of each byte."""
-    raw = (value & 0xFFFF_FFFF).to_bytes(4, "little")
-    tops = sum((byte >> 7) << index for index, byte in enumerate(raw))
-    return bytes((tops, *(byte & 0x7F for byte in raw)))
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> TicLens:
@@ -161,13 +119,13 @@ class TicLens:
         self._implausible = 0
         self._fault: str | None = None
         self._stop_bytes = {
-            StopMode.ABRUPT: self._frame(HALT_AND_HOLD),
-            StopMode.RAMPED: self._frame(SET_TARGET_VELOCITY, long_word(0)),
+            StopMode.ABRUPT: self._frame(wire.HALT_AND_HOLD),
+            StopMode.RAMPED: self._frame(wire.SET_TARGET_VELOCITY, long_word(0)),
         }
-        get = self._frame(GET_VARIABLE, bytes((0x22, 8)))
-        self._query_head = len(self._frame(RESET_TIMEOUT) + get)
-        self._query_bytes = self._frame(RESET_TIMEOUT) + get + self._frame(GET_VARIABLE, bytes((0x01, 3)))
-        self._reply_length = 8 + 3 + 2 * settings.crc_responses
+        get = self._frame(wire.GET_VARIABLE, bytes((0x22, 8)))
+        self._query_head = len(self._frame(wire.RESET_TIMEOUT) + get)
+        self._query_bytes = self._frame(wire.RESET_TIMEOUT) + get + self._frame(wire.GET_VARIABLE, bytes((0x01, 3)))
+        self._reply_length = reply_length(crc=settings.crc_responses)
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -195,28 +153,28 @@ class TicLens:
         state = self._ask(0x00, 9)
         step_mode = self._ask(0x49, 1)[0]
         supply_mv = int.from_bytes(self._ask(0x33, 2), "little")
-        if state[0] not in _OPERATION_STATES or step_mode > 9 or not 2_000 <= supply_mv <= 60_000:
+        if state[0] not in wire.OPERATION_STATES or step_mode > 9 or not 2_000 <= supply_mv <= 60_000:
             raise LensError(
                 f"lens port {self._settings.port or '(in memory)'}: what answered is not a Tic: operation state "
                 f"{state[0]}, step mode {step_mode}, supply {supply_mv} mV; check lens.board, baud and CRC settings"
             )
         acceleration = long_word(round(self._limits.acceleration_sps2 * 100))
-        setup = [(SET_MAX_ACCELERATION, acceleration), (SET_MAX_DECELERATION, acceleration)]
-        setup.append((SET_STARTING_SPEED, long_word(0)))
+        setup = [(wire.SET_MAX_ACCELERATION, acceleration), (wire.SET_MAX_DECELERATION, acceleration)]
+        setup.append((wire.SET_STARTING_SPEED, long_word(0)))
         for command, data in setup:
             self._send(self._frame(command, data))
         if any(self._ask(0x26, 4)):
             self._send(self._stop_bytes[StopMode.ABRUPT])
-        self._send(self._frame(ENERGIZE) + self._frame(EXIT_SAFE_START))
+        self._send(self._frame(wire.ENERGIZE) + self._frame(wire.EXIT_SAFE_START))
         self._await_report(after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms))
-        self._referenced = not self._status & _UNCERTAIN
+        self._referenced = not self._status & wire.UNCERTAIN
 
     def home(self, deadline: HostNs) -> LensReport:
         """Run to the reverse limit switch; position 0 is where it lets go."""
         self._check_fault()
         self._prepare()
         self._referenced = self._halted_softly = False
-        self._send(self._frame(EXIT_SAFE_START) + self._frame(GO_HOME, b"\0"))
+        self._send(self._frame(wire.EXIT_SAFE_START) + self._frame(wire.GO_HOME, b"\0"))
         self._rest_due_ns = None
         seen, patience = False, after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
         while True:
@@ -226,14 +184,14 @@ class TicLens:
                     "homing did not end before its deadline; check the limit switch, or allow more time"
                 )
             report = self._poll(fuse=False)
-            homing = bool(self._status & _HOMING)
+            homing = bool(self._status & wire.HOMING)
             seen = seen or homing
             if report and seen and not homing and not report.moving:
                 break
             if not seen and now >= patience:
                 raise self._trouble("the Tic did not start to home; set up a reverse limit switch in its settings")
             self._clock.sleep_until(after_ms(now, self._settings.query_ms))
-        if self._status & _UNCERTAIN:
+        if self._status & wire.UNCERTAIN:
             raise self._trouble("homing ended without a certain position; look at the limit switch")
         self._referenced = True
         with self._lock:
@@ -257,14 +215,15 @@ class TicLens:
             now = self._clock.now_ns()
             steps = self._trajectory.position_at(now).steps
             moving_sps = self._trajectory.velocity_at(now)
-        target = run_target(steps, moving_sps, velocity_sps, until - now, self._limits, referenced=self._referenced)
+        spare_ns = until - now - self._latency_ns - 3 * self._sigma_ns - 14 * self._byte_ns
+        target = run_target(steps, moving_sps, velocity_sps, spare_ns, self._limits, referenced=self._referenced)
         return self._go(target, abs(velocity_sps), "run")
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte(s) now, from any thread; the books are kept afterwards."""
         data = self._stop_bytes[mode]
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         with self._lock:
             effective = self._on_wire(len(data), begun) + self._latency_ns
@@ -304,10 +263,10 @@ class TicLens:
     def _go(self, target: int, speed_sps: float, name: str) -> CommandStamp:
         self._prepare()
         word = max(1, round(speed_sps * 10_000))
-        data = b"" if word == self._speed_word else self._frame(SET_MAX_SPEED, long_word(word))
-        data += self._frame(SET_TARGET_POSITION, long_word(target))
+        data = b"" if word == self._speed_word else self._frame(wire.SET_MAX_SPEED, long_word(word))
+        data += self._frame(wire.SET_TARGET_POSITION, long_word(target))
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         done = self._clock.now_ns()
         self._speed_word = word
         with self._lock:
@@ -323,7 +282,7 @@ class TicLens:
         """Clear what keeps an idle Tic from moving: its command timeout and the safe start that follows."""
         idle = self._report is None or self._clock.now_ns() - self._report.latest_ns > 200 * NS_PER_MS
         if self._errors or idle:
-            self._send(self._frame(ENERGIZE) + self._frame(EXIT_SAFE_START))
+            self._send(self._frame(wire.ENERGIZE) + self._frame(wire.EXIT_SAFE_START))
             self._errors = 0
 
     # --- queries and replies ---------------------------------------------------------------------------------------
@@ -331,7 +290,7 @@ class TicLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = None
         now = self._clock.now_ns()
-        self._received += self._port.read_available()
+        self._received += self._read()
         if self._query and len(self._received) >= self._reply_length:
             report = self._parse(now, fuse=fuse)
         if self._unanswered_since_ns is not None:
@@ -345,7 +304,7 @@ class TicLens:
         if lost or (self._query is None and now >= self._next_query_ns):
             self._received.clear()
             begun = self._clock.now_ns()
-            self._port.write(self._query_bytes)
+            self._write(self._query_bytes)
             with self._lock:
                 end = self._on_wire(len(self._query_bytes), begun)
             self._query = _Query(begun, end - (len(self._query_bytes) - self._query_head) * self._byte_ns)
@@ -356,18 +315,11 @@ class TicLens:
 
     def _parse(self, now: int, *, fuse: bool) -> LensReport | None:
         query, self._query = self._query, None
-        raw, damaged = bytes(self._received), len(self._received) > self._reply_length
+        reply = parse_reply(bytes(self._received), crc=self._settings.crc_responses)
         self._received.clear()
-        if self._settings.crc_responses:
-            damaged = damaged or crc7(raw[:8]) != raw[8] or crc7(raw[9:12]) != raw[12]
-            raw = raw[:8] + raw[9:12]
-        if damaged or query is None or raw[8] & 0xE0:
+        if reply is None or query is None or abs(reply.velocity_sps) > 2 * self._limits.max_speed_sps:
             return None  # the silence limit counts on; the next query resynchronises
-        position = int.from_bytes(raw[0:4], "little", signed=True)
-        velocity = int.from_bytes(raw[4:8], "little", signed=True) / 10_000
-        status, errors = raw[8], int.from_bytes(raw[9:11], "little")
-        if abs(velocity) > 2 * self._limits.max_speed_sps or errors & 0xFE00:
-            return None
+        position, velocity, status, errors = reply.position, reply.velocity_sps, reply.flags, reply.errors
         latest = max(now - self._reply_length * self._byte_ns, query.sampled_from_ns)
         flags = LensFlag.MOVING if velocity else LensFlag.NONE
         # a moving motor is half a step beyond the last one that it made, on average
@@ -386,7 +338,7 @@ class TicLens:
     def _believe(self, report: LensReport, status: int) -> bool:
         """Learn from a report, unless it is impossible; raise when the impossible is confirmed."""
         with self._lock:
-            if not self._trajectory.known or (status & (_FORWARD_LIMIT | _REVERSE_LIMIT) and not report.moving):
+            if not self._trajectory.known or (status & (wire.FORWARD_LIMIT | wire.REVERSE_LIMIT) and not report.moving):
                 self._trajectory.begin(report)
                 self._implausible = 0
                 return True
@@ -407,13 +359,13 @@ class TicLens:
     def _watch_errors(self, errors: int, report: LensReport) -> None:
         """Raise for what a person must look at; an idle Tic's timeout is cleared before the next motion."""
         under_way = self._rest_due_ns is not None and report.latest_ns < self._rest_due_ns
-        serious = errors & ~_RECOVERABLE
+        serious = errors & ~wire.RECOVERABLE
         if serious or (errors and under_way and not report.moving):
-            words = ", ".join(word for bit, word in _ERROR_WORDS.items() if errors & bit)
+            words = ", ".join(word for bit, word in wire.ERROR_WORDS.items() if errors & bit)
             raise self._trouble(f"the Tic stopped itself: {words} (error bits {errors:#06x}); remove the cause, home")
 
     def _watch_reference(self, report: LensReport, position: int) -> None:
-        if not self._status & _UNCERTAIN:
+        if not self._status & wire.UNCERTAIN:
             return
         if not self._halted_softly:
             self._referenced = self._referenced and self._rest_due_ns is not None and report.moving
@@ -423,7 +375,7 @@ class TicLens:
             and self._rest_due_ns is not None
             and report.earliest_ns > self._rest_due_ns - 20 * NS_PER_MS
         ):
-            self._send(self._frame(HALT_AND_SET_POSITION, long_word(position)))
+            self._send(self._frame(wire.HALT_AND_SET_POSITION, long_word(position)))
             self._halted_softly = False
 
     def _watch_motion(self, report: LensReport) -> None:
@@ -435,18 +387,18 @@ class TicLens:
             return
         self._stops_ignored += 1
         if self._stops_ignored > 3:
-            self._port.write(self._frame(DEENERGIZE))
+            self._write(self._frame(wire.DEENERGIZE))
             raise self._trouble(
                 f"the motor still runs at {report.velocity_sps or 0.0:.0f} steps/s after "
                 f"{self._stops_ignored - 1} stops; its driver was switched off"
             )
-        self._port.write(self._stop_bytes[StopMode.ABRUPT])
+        self._write(self._stop_bytes[StopMode.ABRUPT])
 
     def _flagged(self, report: LensReport) -> LensReport:
         flags = report.flags
         if self._referenced:
             flags |= LensFlag.REFERENCED
-        if self._status & (_FORWARD_LIMIT | _REVERSE_LIMIT):
+        if self._status & (wire.FORWARD_LIMIT | wire.REVERSE_LIMIT):
             flags |= LensFlag.LIMIT
         if not self._referenced:
             flags |= LensFlag.POSITION_UNCERTAIN
@@ -460,7 +412,7 @@ class TicLens:
 
     def _send(self, data: bytes) -> None:
         begun = self._clock.now_ns()
-        self._port.write(data)
+        self._write(data)
         with self._lock:
             self._on_wire(len(data), begun)
 
@@ -472,11 +424,11 @@ class TicLens:
     def _ask(self, offset: int, length: int) -> bytes:
         """Read variables, waiting for the reply within the limit."""
         self._received.clear()
-        self._send(self._frame(GET_VARIABLE, bytes((offset, length))))
+        self._send(self._frame(wire.GET_VARIABLE, bytes((offset, length))))
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
         expected = length + self._settings.crc_responses
         while True:
-            self._received += self._port.read_available()
+            self._received += self._read()
             now = self._clock.now_ns()
             if len(self._received) >= expected:
                 break
@@ -506,6 +458,26 @@ class TicLens:
                 raise self._trouble("no report after connecting; check the cable")
             self._clock.sleep_until(after_ms(now, 0.5))
 
+    def _write(self, data: bytes) -> None:
+        """Write, or latch that the line is dead."""
+        try:
+            self._port.write(data)
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _read(self) -> bytes:
+        """Read what has come, or latch that the line is dead."""
+        try:
+            return self._port.read_available()
+        except LensError as error:
+            self._latch(str(error))
+            raise
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+        self._referenced = False
+
     def _check_fault(self) -> None:
         if self._fault is not None:
             raise LensError(self._fault)
@@ -516,6 +488,5 @@ class TicLens:
             self._port.write(self._stop_bytes[StopMode.ABRUPT])
         except LensError as error:
             what = f"{what} (and the halt could not be written: {error})"
-        self._fault = f"lens: {what}"
-        self._referenced = False
+        self._latch(f"lens: {what}")
         return LensError(self._fault)

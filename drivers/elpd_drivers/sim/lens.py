@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elpd.motion.trajectory import Piece, approach, ramp
+from elpd.motion.kinematics import Piece, approach, ramp
 from elpd.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -136,10 +136,12 @@ class SimulatedLens:
 
     def follow(self, at_ns: int, pieces: Iterable[Piece]) -> None:
         """Replace the path from *at_ns* on by *pieces*, laid end to end; the last one lasts for ever."""
-        pulses, rotor, carriage = self._state(at_ns)
         before = self._at(at_ns - 1)
-        velocity_before = before.velocity_at(at_ns)
-        follows = before.follows or velocity_before == 0.0
+        self._lay(at_ns, pieces, follows=before.follows or before.velocity_at(at_ns) == 0.0)
+
+    def _lay(self, at_ns: int, pieces: Iterable[Piece], *, follows: bool) -> None:
+        pulses, rotor, carriage = self._state(at_ns)
+        velocity_before = self._at(at_ns - 1).velocity_at(at_ns)
         while self._stretches and self._stretches[-1].begin_ns >= at_ns:
             self._stretches.pop()
         self._rings = [ring for ring in self._rings if ring[0] < at_ns]
@@ -261,7 +263,7 @@ class SimulatedLens:
         now = self._at(at_ns)
         rest = [s for s in self._stretches if s.begin_ns > at_ns]
         pieces = [_piece(now, at_ns, now.end_ns), *(_piece(s, s.begin_ns, s.end_ns) for s in rest)]
-        self.follow(at_ns, pieces)
+        self._lay(at_ns, pieces, follows=True)
 
     def _keeps_up(self, part: Piece, *, follows: bool) -> bool:
         if self._stuck:

@@ -45,7 +45,8 @@ LARGEST_BLUR_PX2 = 576.0
 
 TRAVEL_PER_STEP_UM = 2.0
 CACHED_PIXELS = 1 << 16
-STEPS_WHILE_LIGHT_CHANGES = 2
+STEPS_WHILE_LIGHT_CHANGES_FAST = 2
+LIGHT_CHANGE_PER_STEP = 0.15
 MOST_STEPS = 4
 
 
@@ -220,11 +221,11 @@ class LightField:
         """Say into how many pieces the time spanned by *conditions* must be cut for the picture to change evenly."""
         lights = [condition.light for condition in conditions]
         if max(lights) != min(lights):
-            return STEPS_WHILE_LIGHT_CHANGES
+            fast = max(lights) - min(lights) > LIGHT_CHANGE_PER_STEP * max(lights)
+            return STEPS_WHILE_LIGHT_CHANGES_FAST if fast else 1
         defocus = [max(condition.sigma2_px2 - SIGMA0_PX**2, 0.0) ** 0.5 for condition in conditions]
         travel_um = sum(abs(after - before) for before, after in pairwise(defocus))
-        if lights[0] > 0:
-            travel_um /= self._px_per_um * min(lights[0], 1.0) ** 0.5
+        travel_um /= self._px_per_um
         return next((n for n in (1, 2) if travel_um <= n * TRAVEL_PER_STEP_UM * 1.05), MOST_STEPS)
 
     def render(self, condition: Condition, window: Roi, out: NDArray[np.float32]) -> None:

@@ -1,6 +1,6 @@
-"""A whole simulated rig: the entry point ``elpd.rigs: sim``, wired by hand.
+"""A simulated rig, whole, wired by hand: the entry point ``elpd.rigs: sim``.
 
-One world holds a camera, an aperture and a lens behind its real wire protocol; the driver that moves the lens is the one
+One world holds a camera, an aperture and a lens behind its real wire protocol; the driver that moves the lens is that
 for real hardware. True focus is drawn over the lens's travel, and the lens begins referenced and at rest beside it.
 What a controller cannot know, the ``Truth`` does: where focus is and where the glass really came to rest.
 
@@ -20,9 +20,10 @@ from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
 from elpd.records import Encoding, Geometry
-from elpd_drivers.lenses import tic
+from elpd_drivers.lenses import grbl, tic
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
+from elpd_drivers.sim.boards.grbl import GrblBoard, GrblConfig
 from elpd_drivers.sim.boards.line import MemoryPort
 from elpd_drivers.sim.boards.tic import TicBoard, TicConfig
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, SimulatedCamera, Wire
@@ -48,7 +49,7 @@ INTERPOLATION_PX = 3
 ROOM_UM = 300.0
 CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
 MASK_SLOTS = {"evk4": 64, "davis346": 8}
-BOARDS = ("tic",)
+BOARDS = ("tic", "grbl")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class SimSettings:
     travel_um: float = 2500.0
     um_per_step: float = 0.3125
     backlash_um: float = 4.0
-    acceleration_um_s2: float = 200_000.0
+    acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
     # faults of the camera
     camera_vanishes_at_s: float | None = None
@@ -261,18 +262,24 @@ def _mechanics(chosen: SimSettings) -> LensMechanics:
 
 
 def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[Lens, MemoryPort]:
+    speed_um_s, acceleration_um_s2 = 3 * chosen.speed_um_s, chosen.acceleration_um_s2
+    born_ns = world.now_ns()
+    if chosen.board == "grbl":
+        setup = GrblConfig(speed_um_s=speed_um_s, acceleration_um_s2=acceleration_um_s2, referenced=True)
+        port = MemoryPort(GrblBoard(mechanism, setup, seed=chosen.seed, begin_ns=born_ns), world)
+        world.add(port)
+        return grbl.open_lens({"um_per_step": chosen.um_per_step, "trust_position": True}, world, port), port
+    if chosen.board != "tic":
+        raise ConfigError(f"sim.board is {chosen.board!r}; known: {', '.join(BOARDS)}")
+    port = MemoryPort(TicBoard(mechanism, TicConfig(referenced=True), seed=chosen.seed, begin_ns=born_ns), world)
+    world.add(port)
     table = {
         "um_per_step": chosen.um_per_step,
         "max_um": chosen.travel_um,
-        "max_speed_um_s": 3 * chosen.speed_um_s,
-        "acceleration_um_s2": chosen.acceleration_um_s2,
+        "max_speed_um_s": speed_um_s,
+        "acceleration_um_s2": acceleration_um_s2,
     }
-    born_ns = world.now_ns()
-    if chosen.board == "tic":
-        port = MemoryPort(TicBoard(mechanism, TicConfig(referenced=True), seed=chosen.seed, begin_ns=born_ns), world)
-        world.add(port)
-        return tic.open_lens(table, world, port), port
-    raise ConfigError(f"sim.board is {chosen.board!r}; known: {', '.join(BOARDS)}")
+    return tic.open_lens(table, world, port), port
 
 
 def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:

@@ -7,9 +7,7 @@ Thresholds differ from pixel to pixel with a fixed pattern; shot noise fires the
 fires ON, hot pixels fire without reason. Time is cut into steps; inside one, the level is a straight line and event
 times are interpolated on it.
 
-The step kernel first goes over a block of pixels without branches, which the compiler turns into vector code, then
-visits the few that may fire. Where the picture stands still nothing is computed
-but noise.
+Where the picture stands still nothing is computed but noise; the kernels stand in ``pixels``.
 """
 
 from __future__ import annotations
@@ -19,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elpd.events.jit import kernel
 from elpd.records import BiasSet, Roi
 from elpd_drivers.sim.optics import CACHED_PIXELS
+from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,11 +32,10 @@ LAG_US_AT_FULL = 60.0
 SLOWEST_LAG_US = 2_000.0
 MISMATCH_SD = 0.035
 MISMATCH_STEP = 0.00125
-BLOCK = 2048
 HOT_PIXEL_HZ = 2_000.0
 UNSETTLED_HZ = 60.0
-UNSETTLED_TAU_US = 1_000.0
-UNSETTLED_US = 4_000
+UNSETTLED_TAU_US = 700.0
+UNSETTLED_US = 3_000
 NEVER_US = 1 << 62
 CAPACITY_MARGIN = 1 << 16
 
@@ -58,191 +55,6 @@ EXPOSE = BiasLevels(c_on=0.25, c_off=1.5, refractory_us=400_000)
 """One ON event per pixel and opening: refractory longer than any opening, OFF all but disabled."""
 
 FOCUS = BiasLevels(c_on=0.18, c_off=0.18, refractory_us=500)
-
-
-@kernel(
-    "int64(float32[::1], float32[::1], float32[::1], float32[::1], uint8[::1], uint8[::1], uint8[::1], int64[::1],"
-    "float32, float32, float32, int64, int64, int64, int64, int64[::1], int64[::1], uint8[::1])"
-)
-def step_pixels(
-    target: NDArray[np.float32],
-    level: NDArray[np.float32],
-    reference: NDArray[np.float32],
-    rate: NDArray[np.float32],
-    spread_on: NDArray[np.uint8],
-    spread_off: NDArray[np.uint8],
-    held: NDArray[np.uint8],
-    release_us: NDArray[np.int64],
-    c_on: np.float32,
-    c_off: np.float32,
-    spread: np.float32,
-    refractory_us: int,
-    begin_us: int,
-    end_us: int,
-    count: int,
-    out_t: NDArray[np.int64],
-    out_pixel: NDArray[np.int64],
-    out_on: NDArray[np.uint8],
-) -> int:
-    """Advance all pixels from *begin_us* to *end_us* and append their events; return the new count of events.
-
-    ``target`` is the log photocurrent at *end_us*, ``level`` the photoreceptor's output (updated), ``reference`` the
-    comparator's (updated), ``rate`` the photoreceptor's bandwidth per us. A pixel whose ``held`` is 1 is in reset
-    until ``release_us``. Thresholds are ``c·(1 + spread·(q - 128))`` with q from ``spread_on`` or ``spread_off``.
-    Events beyond the capacity of the outputs are counted but not kept. The lag is the implicit Euler rule, whose
-    delay of a ramp is exactly the time constant whatever the step.
-    """
-    capacity = out_t.shape[0]
-    pixels = target.shape[0]
-    step = np.float32(end_us - begin_us)
-    one = np.float32(1)
-    on_base, on_slope = c_on * (one - np.float32(128) * spread), c_on * spread
-    off_base, off_slope = c_off * (one - np.float32(128) * spread), c_off * spread
-    before = np.empty(BLOCK, np.float32)
-    stirred = np.zeros(BLOCK, np.uint8)
-    eights = stirred.view(np.uint64)
-    for start in range(0, pixels, BLOCK):
-        stop = min(start + BLOCK, pixels)
-        goal, now, base_, speed = target[start:stop], level[start:stop], reference[start:stop], rate[start:stop]
-        q_on, q_off, reset = spread_on[start:stop], spread_off[start:stop], held[start:stop]
-        for k in range(stop - start):
-            old = now[k]
-            before[k] = old
-            gain = step * speed[k]
-            new = old + (goal[k] - old) * (gain / (one + gain))
-            now[k] = new
-            moved = new - base_[k]
-            rises = moved >= on_base + on_slope * np.float32(q_on[k])
-            falls = -moved >= off_base + off_slope * np.float32(q_off[k])
-            stirred[k] = np.uint8(rises) | np.uint8(falls) | reset[k]
-        for k in range(stop - start):
-            if k % 8 == 0 and eights[k // 8] == 0:
-                continue
-            if stirred[k] == 0:
-                continue
-            i = start + k
-            first, last = before[k], level[i]
-            slope = (last - first) / step
-            base = reference[i]
-            free_us = begin_us
-            if held[i] != 0:
-                if release_us[i] >= end_us:
-                    continue
-                free_us = max(begin_us, release_us[i])
-                base = first + slope * np.float32(free_us - begin_us)
-                held[i] = 0
-            threshold_on = on_base + on_slope * np.float32(spread_on[i])
-            threshold_off = off_base + off_slope * np.float32(spread_off[i])
-            while held[i] == 0:
-                if last - base >= threshold_on:
-                    on, crossing = 1, base + threshold_on
-                elif base - last >= threshold_off:
-                    on, crossing = 0, base - threshold_off
-                else:
-                    break
-                at_us = free_us
-                if slope != np.float32(0):
-                    at_us = begin_us + int((crossing - first) / slope)
-                at_us = min(max(at_us, free_us), end_us - 1)
-                if count < capacity:
-                    out_t[count] = at_us
-                    out_pixel[count] = i
-                    out_on[count] = on
-                count += 1
-                free_us = at_us + refractory_us
-                if free_us >= end_us:
-                    held[i] = 1
-                    release_us[i] = free_us
-                else:
-                    base = first + slope * np.float32(free_us - begin_us)
-            reference[i] = base
-    return count
-
-
-@kernel(
-    "int64(int64[::1], int64[::1], uint8[::1], float32[::1], float32[::1], uint8[::1], int64[::1],"
-    "float32, float32, float32[::1], int64, int64, int64[::1], int64[::1], uint8[::1])"
-)
-def fire_noise(
-    times_us: NDArray[np.int64],
-    pixels: NDArray[np.int64],
-    kinds: NDArray[np.uint8],
-    level: NDArray[np.float32],
-    reference: NDArray[np.float32],
-    held: NDArray[np.uint8],
-    release_us: NDArray[np.int64],
-    c_on: np.float32,
-    c_off: np.float32,
-    dice: NDArray[np.float32],
-    refractory_us: int,
-    count: int,
-    out_t: NDArray[np.int64],
-    out_pixel: NDArray[np.int64],
-    out_on: NDArray[np.uint8],
-) -> int:
-    """Let candidate noise events (sorted by time) fire where the pixel is not held; return the new count.
-
-    Kind 0 fires the comparator that the residual is nearer to, with probability linear in it; kind 1 fires ON.
-    """
-    capacity = out_t.shape[0]
-    for k in range(times_us.shape[0]):
-        i, t = pixels[k], times_us[k]
-        residual = level[i] - reference[i]
-        if held[i] != 0:
-            if release_us[i] > t:
-                continue
-            residual = np.float32(0)
-        on = 1
-        if kinds[k] == 0 and dice[k] * (c_on + c_off) >= residual + c_off:
-            on = 0
-        if count < capacity:
-            out_t[count] = t
-            out_pixel[count] = i
-            out_on[count] = on
-        count += 1
-        held[i] = 1
-        release_us[i] = t + refractory_us
-    return count
-
-
-@kernel(
-    "void(int64[::1], int64[::1], uint8[::1], int64, int64, int64, int64, int64, int64,"
-    "int64[::1], int64[::1], uint16[::1], uint16[::1], uint8[::1])"
-)
-def sort_events(
-    t: NDArray[np.int64],
-    pixel: NDArray[np.int64],
-    on: NDArray[np.uint8],
-    count: int,
-    begin_us: int,
-    span_us: int,
-    width: int,
-    x0: int,
-    y0: int,
-    heads: NDArray[np.int64],
-    out_t: NDArray[np.int64],
-    out_x: NDArray[np.uint16],
-    out_y: NDArray[np.uint16],
-    out_on: NDArray[np.uint8],
-) -> None:
-    """Counting-sort *count* events by time (stable) and turn pixel numbers of the window into x and y.
-
-    *heads* is scratch of ``span_us + 1``. All times lie in ``[begin_us, begin_us + span_us)``.
-    """
-    heads[:] = 0
-    for k in range(count):
-        heads[t[k] - begin_us + 1] += 1
-    for bin_ in range(span_us):
-        heads[bin_ + 1] += heads[bin_]
-    for k in range(count):
-        bin_ = t[k] - begin_us
-        place = heads[bin_]
-        heads[bin_] += 1
-        row = pixel[k] // width
-        out_t[place] = t[k]
-        out_x[place] = x0 + pixel[k] - row * width
-        out_y[place] = y0 + row
-        out_on[place] = on[k]
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,6 +101,7 @@ class EventSensor:
         self._noise_hz = noise_hz
         self._leak_hz = leak_hz
         self._unsettled_since_us = -NEVER_US
+        self._unsettled = False
         unit = MISMATCH_SD / MISMATCH_STEP
         drawn = np.clip(np.rint(128 + unit * pattern.standard_normal((2, height, width))), 0, 255)
         self._spread_on, self._spread_off = drawn.astype(np.uint8)
@@ -330,13 +143,11 @@ class EventSensor:
     def apply_biases(self, biases: BiasSet, now_us: int) -> None:
         """Switch thresholds and refractory time; for a few milliseconds the pixels fire without order.
 
-        What fires in that time is not held longer than it lasts, as if the comparators' bias were still moving.
+        Moving biases disturb what the pixels remember: at the end of that time all are reset, at their present level.
         """
         self._biases = self._sets[biases]
         self._unsettled_since_us = now_us
-        held_until = now_us + self._biases.refractory_us
-        np.minimum(self._release_us, held_until, out=self._release_us)
-        self._apply_mask()
+        self._unsettled = True
 
     def restart(self) -> None:
         """Let all pixels begin anew, at whatever they are settled on next."""
@@ -365,10 +176,16 @@ class EventSensor:
             np.exp(log_rows, out=rows)
             rows *= np.float32(1 / LAG_US_AT_FULL)
             np.maximum(rows, np.float32(1 / SLOWEST_LAG_US), out=rows)
+        self._gain_fits_us = 0
 
     def begin(self, begin_us: int, end_us: int) -> None:
         """Open a span of time; its steps follow in order, then ``finish``."""
         self._begin_us, self._end_us, self._count = begin_us, end_us, 0
+        if self._unsettled and begin_us >= self._unsettled_since_us + UNSETTLED_US:
+            self._unsettled = False
+            self._reference[:] = self.level
+            self._held.fill(0)
+            self._apply_mask()
 
     def noise(self, begin_us: int, end_us: int) -> None:
         """Let noise, leakage and hot pixels fire in a part of the span, before the same part's ``step``."""
@@ -377,21 +194,18 @@ class EventSensor:
             return
         biases = self._biases
         dice = self._chance.random(len(times), np.float32)
-        settled_us = self._unsettled_since_us + UNSETTLED_US
-        held_for_us = (
-            biases.refractory_us if begin_us >= settled_us else min(biases.refractory_us, settled_us - begin_us)
-        )
         self._count = fire_noise(
             times, pixels, kinds, self.level.ravel(), self._reference.ravel(), self._held.ravel(),
-            self._release_us.ravel(), np.float32(biases.c_on), np.float32(biases.c_off), dice, held_for_us,
+            self._release_us.ravel(), np.float32(biases.c_on), np.float32(biases.c_off), dice, biases.refractory_us,
             self._count, self._out_t, self._out_pixel, self._out_on,
         )  # fmt: skip
 
     def step(self, target: NDArray[np.float32], begin_us: int, end_us: int) -> None:
         """Let the picture change evenly to *target* in a part of the span."""
         biases = self._biases
+        self._fit_gain(end_us - begin_us)
         self._count = step_pixels(
-            target.ravel(), self.level.ravel(), self._reference.ravel(), self._rate.ravel(),
+            target.ravel(), self.level.ravel(), self._reference.ravel(), self._gain.ravel(),
             self._window_on.ravel(), self._window_off.ravel(), self._held.ravel(), self._release_us.ravel(),
             np.float32(biases.c_on), np.float32(biases.c_off), np.float32(MISMATCH_STEP), biases.refractory_us,
             begin_us, end_us, self._count, self._out_t, self._out_pixel, self._out_on,
@@ -408,6 +222,16 @@ class EventSensor:
             self.window.x, self.window.y, np.empty(span_us + 1, np.int64), t, x, y, on,
         )  # fmt: skip
         return Events(t, x, y, on, self._count - kept)
+
+    def _fit_gain(self, step_us: int) -> None:
+        """Set the photoreceptors' gain for a step: implicit Euler, which delays a ramp by exactly the time constant."""
+        if self._gain_fits_us == step_us:
+            return
+        self._gain_fits_us = step_us
+        parts = max(1, self._rate.size // CACHED_PIXELS)
+        for rate, gain in zip(np.array_split(self._rate, parts), np.array_split(self._gain, parts), strict=True):
+            np.multiply(rate, np.float32(step_us), out=gain)
+            np.divide(gain, gain + np.float32(1), out=gain)
 
     def _noise_candidates(
         self, begin_us: int, end_us: int
@@ -440,6 +264,7 @@ class EventSensor:
         self.level = np.zeros(shape, np.float32)
         self._reference = np.zeros(shape, np.float32)
         self._rate = np.full(shape, 1 / SLOWEST_LAG_US, np.float32)
+        self._gain, self._gain_fits_us = np.empty(shape, np.float32), 0
         self._held = np.zeros(shape, np.uint8)
         self._release_us = np.zeros(shape, np.int64)
         self._entering = np.ones(shape, np.bool_)

@@ -4,7 +4,8 @@ A simulated rig has one consumer (the focus loop) and a few devices, so a schedu
 one number, the present instant, and moves it in ``sleep_until``: in slices short enough that a byte written at one
 instant reaches its board before the next, telling each actor to catch up. Nothing else moves time, so a run is as
 fast as the CPU and repeats bit for bit. With a *pace* the world additionally sleeps so as never to run ahead of the
-wall clock; it may fall behind, and ``lag_s`` says by how much.
+wall clock; it may fall behind, and ``lag_s`` says by how much. It makes up for at most 50 ms of that, so that after an
+idle minute, in which nobody waited, it does not rush through the next one.
 
 Randomness is one generator per component, derived from the seed and the component's name, so that a part which
 draws once more does not change what another part sees.
@@ -26,6 +27,9 @@ BIRTH_NS = HostNs(NS_PER_S)
 
 SLICE_NS = 250_000
 """The longest that actors are left alone while time passes."""
+
+CATCH_UP_S = 0.05
+"""How far behind the wall clock a paced world may be and still hurry."""
 
 
 class Actor(Protocol):
@@ -51,7 +55,7 @@ class World:
         self._pace = pace
         self._now = BIRTH_NS
         self._actors: list[Actor] = []
-        self._wall_birth_s = time.monotonic()
+        self._wall_birth_s = self._anchor_s = time.monotonic()
 
     def add(self, actor: Actor) -> None:
         """Let *actor* live here from now on."""
@@ -68,17 +72,23 @@ class World:
             for actor in self._actors:
                 actor.advance_to(self._now)
         if self._pace > 0:
-            ahead_s = -self.lag_s
-            if ahead_s > 0:
-                time.sleep(ahead_s)
+            self._keep_pace()
 
     @property
     def lag_s(self) -> float:
         """How far the paced world is behind the wall clock, in wall seconds; negative if ahead; 0 without a pace."""
-        if self._pace == 0:
-            return 0.0
-        passed_s = (self._now - BIRTH_NS) / NS_PER_S
-        return time.monotonic() - self._wall_birth_s - passed_s / self._pace
+        return 0.0 if self._pace == 0 else time.monotonic() - self._wall_birth_s - self._passed_s()
+
+    def _keep_pace(self) -> None:
+        behind_s = time.monotonic() - self._anchor_s - self._passed_s()
+        if behind_s < 0:
+            time.sleep(-behind_s)
+        elif behind_s > CATCH_UP_S:
+            self._anchor_s += behind_s - CATCH_UP_S
+
+    def _passed_s(self) -> float:
+        """Return how long, in wall seconds, the time since birth should have taken."""
+        return (self._now - BIRTH_NS) / NS_PER_S / self._pace
 
 
 def random_stream(seed: int, component: str) -> np.random.Generator:

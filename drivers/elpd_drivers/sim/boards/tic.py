@@ -12,13 +12,25 @@ from __future__ import annotations
 import random
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum, IntEnum, IntFlag
 from typing import TYPE_CHECKING, Any
 
 from elpd.units import NS_PER_MS, NS_PER_S
 from elpd_drivers.sim.boards.line import PtyServer
 from elpd_drivers.sim.boards.settings import lens_and_config
+from elpd_drivers.sim.boards.tic_words import (
+    BLOCK,
+    CLEARS_SERIAL_ERROR,
+    LONG,
+    MAX_BLOCK,
+    NOT_A_COMMAND,
+    SEVEN_BIT,
+    MemoryMap,
+    crc7,
+    decode_long,
+    payload_length,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -69,24 +81,6 @@ class _Homing(Enum):
     NO = "no"
     TOWARDS = "towards"
     AWAY = "away"
-
-
-_QUICK = frozenset({0x83, 0x85, 0x86, 0x89, 0x8A, 0x8C, 0x8F, 0xB0})
-_SEVEN_BIT = frozenset({0x91, 0x92, 0x94, 0x97, 0x98})
-_LONG = frozenset({0xE0, 0xE3, 0xE5, 0xE6, 0xE9, 0xEA, 0xEC})
-_BLOCK = frozenset({0xA1, 0xA2, 0xA8})
-_CLEARS_SERIAL_ERROR = frozenset({0xE0, 0xE3, 0xEC, 0x89, 0x85, 0x83, 0xB0})
-_MAX_BLOCK = 15
-
-
-def crc7(data: bytes) -> int:
-    """Return the CRC that the Tic wants behind a command: polynomial 0x91, least significant bit first."""
-    crc = 0
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc ^ 0x91) >> 1 if crc & 1 else crc >> 1
-    return crc
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +152,7 @@ class TicBoard:
         for byte in data:
             if byte & 0x80:
                 if self._frame:
-                    self._serial_error(TicError.SERIAL_FORMAT)
+                    self._serial_error(TicError.SERIAL_FORMAT, at_ns)
                 self._frame = bytearray((byte,))
             elif self._frame:
                 self._frame.append(byte)
@@ -209,34 +203,43 @@ class TicBoard:
             return
         command = frame[2] | 0x80 if pololu else frame[0]
         header = 3 if pololu else 1
-        length = _payload_length(command)
+        length = payload_length(command)
         if length is None:
             self._frame = bytearray()
-            self._serial_error(TicError.SERIAL_FORMAT)
+            self._serial_error(TicError.SERIAL_FORMAT, at_ns)
             return
         if len(frame) < header + length + self.config.crc_commands:
             return
         self._frame = bytearray()
         if self.config.crc_commands and crc7(bytes(frame[:-1])) != frame[-1]:
-            self._serial_error(TicError.SERIAL_CRC)
+            self._serial_error(TicError.SERIAL_CRC, at_ns)
             return
         if pololu and frame[1] != self.config.device_number:
             return
+        self._queue(command, bytes(frame[header : header + length]), at_ns)
+
+    def _queue(self, command: int, payload: bytes, at_ns: int) -> None:
+        """Let a command take effect after the firmware's latency, and never before an earlier one."""
         latency = self._random.randint(*self.config.latency_us) * 1000
-        due = max(at_ns + latency, self._pending[-1][0] if self._pending else 0)
-        self._pending.append((due, command, bytes(frame[header : header + length])))
+        self._pending.append((max(at_ns + latency, self._pending[-1][0] if self._pending else 0), command, payload))
+
+    def _serial_error(self, error: TicError, at_ns: int) -> None:
+        self._queue(NOT_A_COMMAND, int(error).to_bytes(4, "little"), at_ns)
 
     def _execute(self, command: int, payload: bytes, at_ns: int) -> None:
-        if command in _CLEARS_SERIAL_ERROR:
+        if command in CLEARS_SERIAL_ERROR:
             self._errors &= ~TicError.SERIAL
-        if command in _CLEARS_SERIAL_ERROR or command == 0x8C:
+        if command in CLEARS_SERIAL_ERROR or command == 0x8C:
             self._errors &= ~TicError.COMMAND_TIMEOUT
             self._restart_timeout(at_ns)
-        if command in _BLOCK:
+        if command == NOT_A_COMMAND:
+            self._occurred |= TicError(int.from_bytes(payload, "little"))
+            self._raise_errors(TicError.SERIAL)
+        elif command in BLOCK:
             self._answer(command, payload, at_ns)
-        elif command in _LONG:
-            self._execute_long(command, _decode_long(payload), at_ns)
-        elif command in _SEVEN_BIT:
+        elif command in LONG:
+            self._execute_long(command, decode_long(payload), at_ns)
+        elif command in SEVEN_BIT:
             self._execute_seven_bit(command, payload[0])
         else:
             self._execute_quick(command, at_ns)
@@ -316,7 +319,7 @@ class TicBoard:
     def _halt(self, at_ns: int) -> None:
         self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
         self.lens.halt(at_ns)
-        self._watch_switches(at_ns)
+        self._switch_ns = None
 
     def _raise_errors(self, errors: TicError) -> None:
         """Note errors and give the soft response: decelerate to hold. Any error violates safe start, too."""
@@ -324,10 +327,6 @@ class TicBoard:
         self._occurred |= errors
         self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
         self._ramp(0.0, self._now_ns)
-
-    def _serial_error(self, error: TicError) -> None:
-        self._occurred |= error
-        self._raise_errors(TicError.SERIAL)
 
     def _acceleration_sps2(self) -> float:
         return self._max_acceleration * 1.0 / ACCELERATION_UNIT
@@ -410,8 +409,8 @@ class TicBoard:
 
     def _answer(self, command: int, payload: bytes, at_ns: int) -> None:
         offset, length = payload[0] | (payload[1] & 0x40) << 1, payload[1] & 0x3F
-        if not 1 <= length <= _MAX_BLOCK:
-            self._serial_error(TicError.SERIAL_FORMAT)
+        if not 1 <= length <= MAX_BLOCK:
+            self._serial_error(TicError.SERIAL_FORMAT, at_ns)
             return
         table = self._settings() if command == 0xA8 else self._variables(at_ns)
         answer = bytes(table[offset : offset + length].ljust(length, b"\0"))
@@ -437,7 +436,7 @@ class TicBoard:
         if self._errors:
             state = _Operation.DEENERGIZED if TicError.DEENERGIZED in self._errors else _Operation.SOFT_ERROR
         since_ns = self._since_last_step_ns(at_ns)
-        table = _Table()
+        table = MemoryMap()
         table.put(0x00, 1, state)
         table.put(0x01, 1, flags)
         table.put(0x02, 2, self._errors & 0xFFFF)
@@ -474,7 +473,7 @@ class TicBoard:
 
     def _settings(self) -> bytearray:
         """Return the 256 bytes that "get setting" reads from; what is not simulated is 0."""
-        config, table = self.config, _Table()
+        config, table = self.config, MemoryMap()
         table.put(0x06, 2, round(12_000_000 / config.baud))
         table.put(0x07, 1, config.device_number & 0x7F)
         table.put(0x09, 2, config.command_timeout_ms)
@@ -491,32 +490,6 @@ class TicBoard:
         table.put(0x61, 4, config.homing_speed_towards)
         table.put(0x65, 4, config.homing_speed_away)
         return table.data
-
-
-@dataclass(slots=True)
-class _Table:
-    """256 bytes, little-endian fields at offsets."""
-
-    data: bytearray = field(default_factory=lambda: bytearray(256))
-
-    def put(self, offset: int, size: int, value: int) -> None:
-        self.data[offset : offset + size] = (int(value) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
-
-
-def _payload_length(command: int) -> int | None:
-    if command in _QUICK:
-        return 0
-    if command in _SEVEN_BIT:
-        return 1
-    if command in _BLOCK:
-        return 2
-    return 5 if command in _LONG else None
-
-
-def _decode_long(payload: bytes) -> int:
-    """Put the top bits, sent together in the first byte, back on their bytes."""
-    raw = bytes(payload[1 + i] | ((payload[0] >> i) & 1) << 7 for i in range(4))
-    return int.from_bytes(raw, "little", signed=True)
 
 
 def _count(pulses: float, velocity_sps: float) -> int:

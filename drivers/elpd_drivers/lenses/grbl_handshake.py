@@ -1,0 +1,180 @@
+"""What is asked of a GRBL board before it is a lens: is it there, is it GRBL 1.1, does it agree with the config.
+
+A board may boot because its port was opened, may be dead after an alarm until it is reset, and may be executing
+somebody else's jog. Each of these has an end in time here, and nothing is moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from elpd.errors import ConfigError, LensError
+from elpd.units import after_ms
+from elpd_drivers.lenses.axis import limits_from
+from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, LineReader, Status, parse_status
+
+if TYPE_CHECKING:
+    from elpd.ports import BytePort, Clock
+    from elpd.records import LensLimits
+
+_VERSIONS = ("[VER:1.1",)
+
+
+@dataclass(frozen=True, slots=True)
+class GrblLensSettings:
+    """The table ``[lens]`` for GRBL. What the board knows (``$100``, ``$110``, ``$120``, ``$130``) is read from it.
+
+    ``um_per_step`` must agree with the board's ``$100``. ``stop_onset_ms`` is the time from a stop byte to the first
+    slower segment. ``trust_position`` believes a board that is idle when it is opened; otherwise it must be homed
+    first. ``connect_ms`` is the patience with a board that boots when its port is opened.
+    """
+
+    port: str = ""
+    baud: int = 115_200
+    um_per_step: float = 0.3125
+    min_um: float = 0.0
+    max_um: float | None = None
+    max_speed_um_s: float | None = None
+    acceleration_um_s2: float | None = None
+    query_ms: float = 6.0
+    reply_ms: float = 60.0
+    connect_ms: float = 3000.0
+    stop_onset_ms: float = 45.0
+    stop_onset_sigma_ms: float = 3.0
+    latency_us: float = 225.0
+    latency_sigma_us: float = 110.0
+    trust_position: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BoardFacts:
+    """What the board says about itself. ``restarted``: its banner came, so its count means nothing."""
+
+    limits: LensLimits
+    steps_per_mm: float
+    travel_mm: float
+    idle: bool
+    restarted: bool
+
+
+def handshake(port: BytePort, clock: Clock, settings: GrblLensSettings) -> BoardFacts:
+    """Identify the board, stop it if it moves, and read its settings.
+
+    Raises ``LensError`` if there is no GRBL 1.1, ``ConfigError`` if its settings contradict the config.
+    """
+    return _Handshake(port, clock, settings).run()
+
+
+class _Handshake:
+    def __init__(self, port: BytePort, clock: Clock, settings: GrblLensSettings) -> None:
+        self._port, self._clock, self._settings = port, clock, settings
+        self._name = settings.port or "(in memory)"
+        self._lines = LineReader()
+        self._restarted = False
+
+    def run(self) -> BoardFacts:
+        self._port.read_available()
+        status = self._status()
+        due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
+        while status.state not in {"Idle", "Alarm"}:
+            # somebody else's motion; what a cancel does not end (a hold), a reset does
+            now = self._clock.now_ns()
+            if now >= after_ms(due, self._settings.connect_ms):
+                raise LensError(f"lens port {self._name}: GRBL stays in state {status.state}; switch it off and on")
+            self._port.write(CANCEL if now < due else RESET)
+            self._clock.sleep_until(after_ms(now, 100))
+            status = self._status()
+        version = self._ask("$I", "[VER:")
+        if not any(line.startswith(_VERSIONS) for line in version):
+            raise LensError(
+                f"lens port {self._name}: this driver speaks GRBL 1.1, the board says {' '.join(version)[:80]!r}; "
+                "update its firmware, or choose another lens.board"
+            )
+        board = self._numbers(self._ask("$$", "$"))
+        limits = _agreed_limits(board, self._settings)
+        return BoardFacts(limits, board[100], board[130], status.state == "Idle", self._restarted)
+
+    def _status(self) -> Status:
+        """Wait for a status report; a board that says nothing may be dead after an alarm, or booting."""
+        start = self._clock.now_ns()
+        due = after_ms(start, self._settings.connect_ms)
+        reset_at = after_ms(start, self._settings.connect_ms / 2)
+        ask_at, seen = start, ""
+        while True:
+            now = self._clock.now_ns()
+            if now >= due:
+                raise LensError(
+                    f"lens port {self._name}: no GRBL answered within {self._settings.connect_ms:.0f} ms (saw "
+                    f"{seen!r}); check power, cable, baud ({self._settings.baud}) and lens.board"
+                )
+            if now >= reset_at:
+                self._port.write(RESET)
+                self._restarted, reset_at = True, due
+            if now >= ask_at:
+                self._port.write(STATUS)
+                ask_at = after_ms(now, 100)
+            for line, _ in self._lines.feed(self._port.read_available()):
+                status = parse_status(line)
+                if status is not None:
+                    return status
+                self._restarted = self._restarted or "Grbl" in line
+                seen = (seen + line)[-80:]
+            self._clock.sleep_until(after_ms(now, 1))
+
+    def _ask(self, line: str, beginning: str) -> list[str]:
+        """Send a line and collect the lines that begin so, up to its ``ok``."""
+        self._port.write(f"{line}\n".encode("ascii"))
+        patience_ms = 10 * self._settings.reply_ms
+        due = after_ms(self._clock.now_ns(), patience_ms)
+        answers: list[str] = []
+        while True:
+            for got, _ in self._lines.feed(self._port.read_available()):
+                if got == "ok":
+                    return answers
+                if got.startswith(beginning):
+                    answers.append(got)
+                elif got.startswith("error:"):
+                    raise LensError(f"lens port {self._name}: GRBL answers {line} with {got}; is it GRBL 1.1?")
+            now = self._clock.now_ns()
+            if now >= due:
+                raise LensError(
+                    f"lens port {self._name}: no answer to {line} within {patience_ms:.0f} ms; check the cable"
+                )
+            self._clock.sleep_until(after_ms(now, 1))
+
+    def _numbers(self, lines: list[str]) -> dict[int, float]:
+        """Read what ``$$`` printed; other firmware adds comments and settings that are no numbers."""
+        board: dict[int, float] = {}
+        for line in lines:
+            number, _, value = line[1:].split(" ")[0].partition("=")
+            try:
+                board[int(number)] = float(value)
+            except ValueError:
+                continue
+        missing = [f"${number}" for number in (100, 110, 120, 130) if board.get(number, 0.0) <= 0.0]
+        if missing:
+            raise LensError(f"lens port {self._name}: the board does not tell {', '.join(missing)}; is it GRBL 1.1?")
+        return board
+
+
+def _agreed_limits(board: dict[int, float], settings: GrblLensSettings) -> LensLimits:
+    """Take travel, speed and acceleration from the board and the config; refuse contradictions."""
+    per_mm, travel_um, speed_um_s = board[100], board[130] * 1000, board[110] / 60 * 1000
+    if abs(per_mm * settings.um_per_step / 1000 - 1) > 1e-3:
+        raise ConfigError(
+            f"lens.um_per_step is {settings.um_per_step:g}, the board's $100 of {per_mm:g} steps/mm makes "
+            f"{1000 / per_mm:g}; correct one of them"
+        )
+    max_um = travel_um if settings.max_um is None else settings.max_um
+    speed = settings.max_speed_um_s or speed_um_s
+    for name, wanted, number, has in (("max_um", max_um, 130, travel_um), ("max_speed_um_s", speed, 110, speed_um_s)):
+        if wanted > has * (1 + 1e-6):
+            raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${number} allows {has:g}; change one of them")
+    acceleration = board[120] * 1000
+    if settings.acceleration_um_s2 is not None and abs(settings.acceleration_um_s2 / acceleration - 1) > 1e-3:
+        raise ConfigError(
+            f"lens.acceleration_um_s2 is {settings.acceleration_um_s2:g}, the board's $120 makes {acceleration:g}; "
+            "leave the key out, or change $120"
+        )
+    return limits_from(1000 / per_mm, settings.min_um, max_um, speed, acceleration)

@@ -1,0 +1,78 @@
+"""The lines of GRBL 1.1: splitting, status reports, jogs, and what its numbers mean. Pure functions and one buffer."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
+MAX_LINE = 512
+ERROR_WORDS = {
+    "1": "expected a letter",
+    "2": "bad number",
+    "3": "unknown $ statement",
+    "4": "negative value",
+    "5": "homing is off, $22=0",
+    "8": "not idle",
+    "9": "locked",
+    "15": "beyond the travel",
+    "16": "invalid jog",
+    "20": "unsupported",
+    "22": "no feed",
+}
+ALARM_WORDS = {
+    "1": "hard limit",
+    "2": "soft limit",
+    "3": "reset in motion",
+    "6": "homing was reset",
+    "7": "door opened while homing",
+    "8": "homing could not leave the switch",
+    "9": "homing did not find the switch",
+}
+_STATE = re.compile(r"<(Idle|Jog|Run|Hold:[01]|Alarm|Home|Door:[0-3]|Check|Sleep)\|")
+_POSITION = re.compile(r"\|MPos:(-?\d+\.\d{3,4}),[-\d.,]+[|>]")
+_PINS = re.compile(r"\|Pn:([A-Z]+)[|>]")
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a status report says."""
+
+    state: str
+    x_mm: float
+    pins: str = ""
+
+
+def parse_status(line: str) -> Status | None:
+    """Read a status report, or return None for anything that is not a whole and sane one."""
+    if not line.endswith(">") or line.count("<") != 1 or line.count(">") != 1:
+        return None
+    state, position, pins = _STATE.match(line), _POSITION.search(line), _PINS.search(line)
+    if state is None or position is None:
+        return None
+    return Status(state[1], float(position[1]), pins[1] if pins else "")
+
+
+def jog_line(x_mm: float, feed_mm_min: float) -> bytes:
+    """Return a jog to an absolute machine position, in mm and mm/min whatever the board's modal state."""
+    return f"$J=G21G90G53X{x_mm:.5f}F{feed_mm_min:.3f}\n".encode("ascii")
+
+
+class LineReader:
+    """Cuts what arrives into lines; what is not ASCII or too long is not a line."""
+
+    def __init__(self) -> None:
+        self._partial = bytearray()
+
+    def feed(self, data: bytes) -> list[tuple[str, int]]:
+        """Return the lines that are complete now, without their ends, each with the number of bytes after it."""
+        self._partial += data
+        lines: list[tuple[str, int]] = []
+        while (end := self._partial.find(b"\n")) >= 0:
+            raw = bytes(self._partial[:end]).strip(b"\r\n\0 ")
+            del self._partial[: end + 1]
+            if raw and raw.isascii():
+                lines.append((raw.decode("ascii"), len(self._partial)))
+        if len(self._partial) > MAX_LINE:
+            self._partial.clear()
+        return lines

@@ -1,0 +1,138 @@
+"""The events of a sweep, kept so that focus can be measured once it has been passed.
+
+Deciding *that* focus was passed needs sums only; measuring *where* needs the events again. This memory keeps those of
+the region and a margin around it, refuses what hot pixels add, follows the band energy of the image they build, and
+answers when asked. It holds a bounded number: the oldest are forgotten first, which costs nothing but a different start
+picture, and the vertex does not depend on the start picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
+from elpd.vision.filters import PixelCap
+from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.track import EventEnergy, PeakTrack
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from elpd.records import Geometry, Roi
+    from elpd.vision.crossing import EventWitnesses, Witness
+    from elpd.vision.ruler import Ruler
+
+MIN_EVENTS = 1_000
+"""Fewer events between the flank of the peak and now make no image worth a vertex (``facts/motion.md`` §4)."""
+
+MAX_EVENTS = 1 << 23
+"""What is kept at most: 13 bytes each."""
+
+LEAST_LEVEL = 1.0 / 3.0
+"""Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
+event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
+
+MIN_RISE = 0.30
+"""Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
+
+
+class EventMemory:
+    """Keeps and questions the events of one sweep.
+
+    Parameters
+    ----------
+    roi, geometry:
+        Where to focus, and on what sensor.
+    max_events:
+        How many are kept.
+    """
+
+    def __init__(self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS) -> None:
+        self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
+        self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
+        self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
+        height, width = self._bottom - self._top, self._right - self._left
+        self._cap = PixelCap(height, width)
+        self._energy = EventEnergy(height, width, ROI_MARGIN_PX)
+        self._shape = (height, width)
+        self._t_us = np.empty(0, dtype=np.int64)
+        self._x = self._y = np.empty(0, dtype=np.uint16)
+        self._on = np.empty(0, dtype=np.uint8)
+        self._taken = 0
+        self._max_events = max_events
+        self.track = PeakTrack()
+        self.capped = 0
+        self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
+
+    def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
+        """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
+        inside = (x >= self._left) & (x < self._right) & (y >= self._top) & (y < self._bottom)
+        t_us, on = t_us[inside], on[inside]
+        x = (x[inside] - self._left).astype(np.uint16)
+        y = (y[inside] - self._top).astype(np.uint16)
+        keep = self._cap.keep(t_us, x, y)
+        self.capped += int(keep.size - keep.sum())
+        # Growth by doubling is numpy's business no more than ours: sweeps are added in a few large pieces.
+        drop = min(max(0, self._t_us.size + int(keep.sum()) - self._max_events), self._taken)
+        self._t_us = np.concatenate([self._t_us[drop:], t_us[keep]])
+        self._x = np.concatenate([self._x[drop:], x[keep]])
+        self._y = np.concatenate([self._y[drop:], y[keep]])
+        self._on = np.concatenate([self._on[drop:], on[keep]])
+        self._taken -= drop
+
+    def advance(self, until_us: int, position: float) -> None:
+        """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
+        until = int(np.searchsorted(self._t_us, until_us, side="left"))
+        part = slice(self._taken, until)
+        self._energy.add(self._x[part], self._y[part], self._on[part])
+        self._taken = until
+        self.track.add(until_us, position, self._energy.measure())
+
+    @property
+    def peak_passed(self) -> bool:
+        """Whether the image has become as sharp as it gets, and duller again, by enough events to believe it."""
+        track = self.track
+        if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
+            return False
+        begin_us = track.times_us[track.flank(FLANK)]
+        return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
+
+    def ask(self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None) -> EventWitnesses | None:
+        """Question the events of the present stretch of motion up to the last ``advance``.
+
+        *brightness* is that of the whole sensor (``Reference.brightness``). ``None`` when there is nothing to ask.
+        Positions in the answer rise with time: they are multiplied by the sign of the motion.
+        """
+        begin_us, _, sign = ruler.stretch(now_us)
+        begin = int(np.searchsorted(self._t_us, begin_us, side="left"))
+        track = self.track
+        if self._taken - begin < MIN_EVENTS or sign == 0 or not len(track):
+            return None
+        flank_us = max(float(track.times_us[track.flank(FLANK)]), begin_us)
+        peak_us = track.times_us[track.peak]
+        if peak_us <= flank_us:
+            return None
+        part = slice(begin, self._taken)
+        position = sign * ruler.at(self._t_us[part])
+        height, width = self._shape
+        events = EventStretch(
+            self._t_us[part], self._x[part], self._y[part], self._on[part], position, height, width, ROI_MARGIN_PX
+        )
+        if brightness is not None:
+            brightness = np.ascontiguousarray(brightness[self._top : self._bottom, self._left : self._right])
+        flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
+        return ask_events(events, flank, peak, now, brightness)
+
+    def witnesses(
+        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None
+    ) -> tuple[list[Witness], float | None]:
+        """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
+        said = self.ask(now_us, ruler, brightness)
+        if said is None or said.vertex is None:
+            return [], None
+        _, _, sign = ruler.stretch(now_us)
+        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
+        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)], said.vertex.width

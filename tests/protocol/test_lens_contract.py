@@ -1,0 +1,313 @@
+"""What every lens driver promises, told as stories in virtual time: simulated lens, simulated board, real bytes."""
+
+from __future__ import annotations
+
+import pytest
+from elpd_drivers.lenses import grbl as grbl_driver
+from elpd_drivers.lenses import tic as tic_driver
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lens_rigs import KINDS, SPEED_SPS, Rig, open_rig, rig
+
+from elpd.errors import ConfigError, LensError, UsageError
+from elpd.records import LensFlag, StopMode
+from elpd.units import Steps
+
+pytestmark = pytest.mark.parametrize("kind", KINDS)
+
+
+def test_it_identifies_itself_and_knows_where_it_is(kind: str) -> None:
+    made = open_rig(kind)
+    made.live(20)
+    assert made.reports
+    assert LensFlag.REFERENCED in made.reports[-1].flags
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(3200, abs=1.7)
+    assert not made.moving
+
+
+def test_it_opens_at_once_after_the_board_was_powered_up(kind: str) -> None:
+    made = open_rig(kind, referenced=False)
+    with pytest.raises(LensError, match="home it first"):
+        made.lens.move_to(Steps(100), SPEED_SPS)
+
+
+def test_a_move_ends_at_rest_on_its_target(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.move_to(Steps(4567), SPEED_SPS)
+    made.live(200)
+    assert made.rotor == pytest.approx(4567, abs=0.01)
+    assert not made.reports[-1].moving
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(4567, abs=0.5)
+
+
+@pytest.mark.parametrize("way", [-1, 1])
+def test_a_run_ends_at_the_limit(kind: str, way: int) -> None:
+    made = open_rig(kind)
+    made.lens.run(way * SPEED_SPS, made.soon(5000))
+    lowest = highest = made.rotor
+    for _ in range(800):
+        made.live(1)
+        lowest, highest = min(lowest, made.rotor), max(highest, made.rotor)
+    assert not made.moving
+    assert made.rotor == pytest.approx(8000 if way > 0 else 0, abs=0.01)
+    assert lowest >= -0.01
+    assert highest <= 8000.01
+
+
+def test_a_run_is_over_by_its_end_in_time_even_if_nobody_polls(kind: str) -> None:
+    made = open_rig(kind)
+    end = made.soon(120)
+    made.lens.run(SPEED_SPS, end)
+    made.clock.pass_ms(60)
+    assert made.moving
+    made.clock.pass_ms(60)
+    assert made.motor.velocity_at(end) == 0.0
+    assert made.rotor > 3200 + 700
+
+
+def test_a_run_while_moving_the_other_way_reverses(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(2000))
+    made.live(60)
+    before = made.rotor
+    made.lens.run(-SPEED_SPS, made.soon(2000))
+    made.live_until(lambda: made.motor.velocity_at(made.clock.now_ns()) < -SPEED_SPS * 0.99, 200)
+    assert made.rotor > before - 400
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
+
+
+def test_a_run_can_change_its_speed(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(60)
+    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    made.live(200)
+    assert made.motor.velocity_at(made.clock.now_ns()) == pytest.approx(SPEED_SPS / 4, rel=1e-3)
+
+
+def test_a_ramped_stop_keeps_the_reference(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(2000))
+    made.live(60)
+    made.lens.stop(StopMode.RAMPED)
+    made.lens.stop(StopMode.RAMPED)
+    made.live(200)
+    assert not made.moving
+    assert LensFlag.REFERENCED in made.reports[-1].flags
+    made.lens.move_to(Steps(3000), SPEED_SPS)
+    made.live(300)
+    assert made.rotor == pytest.approx(3000, abs=0.01)
+
+
+def test_an_abrupt_stop_bites_at_once(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(2000))
+    made.live(60)
+    made.lens.stop(StopMode.ABRUPT)
+    made.clock.pass_ms(1)
+    assert not made.moving
+    made.live(100)
+    referenced = LensFlag.REFERENCED in made.reports[-1].flags
+    assert referenced == made.lens.capabilities.abrupt_stop
+
+
+def test_a_stop_overtakes_a_reversal_that_waits(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(2000))
+    made.live(60)
+    made.lens.run(-SPEED_SPS, made.soon(2000))
+    made.live(2)
+    made.lens.stop(StopMode.RAMPED)
+    made.live(300)
+    assert not made.moving
+    rest = made.rotor
+    made.live(300)
+    assert made.rotor == rest
+
+
+def test_a_stop_right_after_the_command_that_moves_is_not_lost(kind: str) -> None:
+    for gap_ms in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0):
+        made = open_rig(kind)
+        made.lens.run(SPEED_SPS, made.soon(3000))
+        made.clock.pass_ms(gap_ms)
+        made.lens.stop(StopMode.RAMPED)
+        made.live(250)
+        assert not made.moving, gap_ms
+
+
+def test_requests_that_make_no_sense_are_refused_and_nothing_moves(kind: str) -> None:
+    made = open_rig(kind)
+    with pytest.raises(UsageError, match="outside the travel"):
+        made.lens.move_to(Steps(8001), SPEED_SPS)
+    with pytest.raises(UsageError, match="limit is"):
+        made.lens.run(1e9, made.soon(100))
+    with pytest.raises(UsageError):
+        made.lens.run(0.0, made.soon(100))
+    with pytest.raises(UsageError):
+        made.lens.run(float("nan"), made.soon(100))
+    made.live(50)
+    assert made.rotor == 3200.0
+
+
+def test_homing_finds_the_reference(kind: str) -> None:
+    made = open_rig(kind, referenced=False)
+    report = made.lens.home(made.soon(10_000))
+    assert LensFlag.REFERENCED in report.flags
+    assert not made.moving
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=2.1)
+    made.lens.move_to(Steps(4000), SPEED_SPS)
+    made.live(500)
+    assert made.rotor == pytest.approx(4000, abs=2.1)
+
+
+def test_homing_past_its_deadline_stops_and_says_so(kind: str) -> None:
+    made = open_rig(kind, referenced=False)
+    with pytest.raises(LensError, match="deadline"):
+        made.lens.home(made.soon(100))
+    made.clock.pass_ms(5)
+    assert not made.moving
+
+
+def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.port.faults.drop_to_host = True
+    begun = made.clock.now_ns()
+    with pytest.raises(LensError, match="limit"):
+        made.live(200)
+    assert made.clock.now_ns() - begun < 100e6
+    made.clock.pass_ms(2)
+    assert not made.moving
+    with pytest.raises(LensError):
+        made.lens.run(SPEED_SPS, made.soon(100))
+
+
+def test_a_line_that_is_dead_outwards_ends_the_motion_inside_the_limits(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.port.faults.drop_to_board = True
+    with pytest.raises(LensError):
+        made.live(200)
+    made.clock.pass_ms(3000)
+    assert not made.moving
+    assert made.rotor <= 8000.01
+
+
+def test_an_unplugged_port_is_noticed_at_once_and_the_position_is_unknown(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.port.faults.disconnect_at_ns = made.clock.now_ns()
+    with pytest.raises(LensError, match="gone"):
+        made.live(5)
+    with pytest.raises(LensError, match="gone"):
+        made.lens.move_to(Steps(10), SPEED_SPS)
+    made.lens.close()
+
+
+def test_a_board_that_restarts_in_motion_is_a_fault_and_comes_back_unreferenced(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.board.reset_at(made.clock.now_ns())
+    with pytest.raises(LensError):
+        made.live(700)
+    made.clock.pass_ms(700)
+    lens = made.open()
+    with pytest.raises(LensError, match="home it first"):
+        lens.move_to(Steps(10), SPEED_SPS)
+
+
+def test_a_motor_that_ignores_stops_is_a_runaway(kind: str) -> None:
+    made = open_rig(kind, ignore_stop=True)
+    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    made.live(40)
+    made.lens.stop(StopMode.ABRUPT if kind == "tic" else StopMode.RAMPED)
+    with pytest.raises(LensError):
+        made.live(600)
+
+
+def test_a_few_damaged_replies_do_no_harm(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    damaged = iter([True, True])
+    made.port.faults.garble = lambda data: bytes(255 - b for b in data) if next(damaged, False) else data
+    made.live(300)
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
+
+
+def test_nothing_but_garbage_stops_the_motor(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.port.faults.garble = lambda data: b"\xa5" * (len(data) + 1)
+    with pytest.raises(LensError):
+        made.live(300)
+    made.clock.pass_ms(2)
+    assert not made.moving
+
+
+def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_confirmed(kind: str) -> None:
+    made = open_rig(kind)
+    made.live(40)
+    if kind == "tic":
+        made.port.faults.garble = lambda d: (b"\0\0\7\0" + d[4:]) if len(d) == 8 else d
+    else:
+        made.port.faults.garble = lambda d: d.replace(b"MPos:-1.500", b"MPos:-0.200")
+    with pytest.raises(LensError, match="home it again"):
+        made.live(100)
+    assert made.rotor == 3200.0
+
+
+def test_another_board_on_the_port_is_refused(kind: str) -> None:
+    other = "grbl" if kind == "tic" else "tic"
+    made = rig(other)
+    driver = tic_driver if kind == "tic" else grbl_driver
+    with pytest.raises(LensError, match=r"answered|no answer|no GRBL"):
+        driver.open_lens({}, made.clock, made.port)
+    with pytest.raises(LensError, match="closed"):
+        made.port.write(b"x")
+
+
+def test_nobody_there_is_a_clear_error(kind: str) -> None:
+    made = rig(kind)
+    made.port.faults.drop_to_host = True
+    with pytest.raises(LensError, match="check"):
+        made.open()
+
+
+def test_unknown_and_wrong_settings_are_refused(kind: str) -> None:
+    made = rig(kind)
+    with pytest.raises(ConfigError, match=r"lens\.sped: unknown key"):
+        made.open(sped=3)
+    with pytest.raises(ConfigError, match=r"lens\.um_per_step"):
+        made.open(um_per_step="small")
+    with pytest.raises(ConfigError):
+        made.open(min_um=100.0, max_um=50.0)
+
+
+def test_closing_stops_the_motor(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.lens.close()
+    made.lens.close()
+    made.clock.pass_ms(100)
+    assert not made.moving
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.binary(max_size=60))
+def test_any_bytes_from_the_line_end_in_a_lens_error_or_nothing(kind: str, data: bytes) -> None:
+    made: Rig = open_rig(kind)
+    made.lens.run(SPEED_SPS / 8, made.soon(3000))
+    made.live(20)
+    first = iter([True])
+    made.port.faults.garble = lambda d: data + d if next(first, False) else d
+    try:
+        made.live(60)
+    except LensError:
+        made.clock.pass_ms(2)
+        assert not made.moving

@@ -1,0 +1,214 @@
+"""Drivers, boards and the command line over a real pty, in real time. Nothing here asserts how long anything took."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import serial
+import ticlib
+from elpd_drivers.lenses import grbl as grbl_driver
+from elpd_drivers.lenses import tic as tic_driver
+from elpd_drivers.lenses.serial_port import SerialPort
+from lens_rigs import KINDS, SPEED_SPS, served
+from virtual import MonotonicClock
+
+from elpd.errors import ConfigError, LensError
+from elpd.records import LensFlag, StopMode
+from elpd.units import HostNs, Steps, after_ms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+CLOCK = MonotonicClock()
+# replies over a pty wait for the scheduler, which is busy when tests run side by side
+PATIENT = {"reply_ms": 2000.0}
+
+
+def open_lens(kind: str, port: str) -> Any:
+    if kind == "tic":
+        return tic_driver.open_lens({"port": port, **PATIENT}, CLOCK)
+    return grbl_driver.open_lens({"port": port, "trust_position": True, "connect_ms": 20_000.0, **PATIENT}, CLOCK)
+
+
+def poll_until(lens: Any, condition: Callable[[Any], bool], limit_s: float = 20.0) -> Any:
+    end = after_ms(CLOCK.now_ns(), limit_s * 1000)
+    while CLOCK.now_ns() < end:
+        report = lens.poll()
+        if report is not None and condition(report):
+            return report
+        CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 1))
+    raise AssertionError(f"not within {limit_s} s")
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def board(kind: str) -> Iterator[Any]:
+    server, motor = served(kind, CLOCK)
+    yield server, motor
+    server.close()
+
+
+def test_a_lens_over_a_pty_moves_and_stops_from_another_thread(kind: str, board: Any) -> None:
+    server, motor = board
+    lens = open_lens(kind, server.port)
+    lens.move_to(Steps(3400), SPEED_SPS)
+    poll_until(lens, lambda report: not report.moving and abs(report.steps - 3400) < 2)
+    lens.run(-SPEED_SPS / 4, HostNs(CLOCK.now_ns() + 10_000_000_000))
+    poll_until(lens, lambda report: report.moving)
+    stops: list[Any] = []
+    stopper = threading.Thread(target=lambda: stops.append(lens.stop(StopMode.RAMPED)))
+    stopper.start()
+    report = poll_until(lens, lambda report: not report.moving)
+    stopper.join()
+    assert stops[0].begun_ns <= stops[0].done_ns
+    assert 0 < report.steps < 3400
+    assert motor.velocity_at(CLOCK.now_ns()) == 0.0
+    lens.close()
+
+
+def test_a_lens_over_a_pty_homes(kind: str, board: Any) -> None:
+    server, _ = board
+    lens = open_lens(kind, server.port)
+    report = lens.home(after_ms(CLOCK.now_ns(), 30_000))
+    assert LensFlag.REFERENCED in report.flags
+    lens.close()
+
+
+def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(kind: str, board: Any) -> None:
+    server, motor = board
+    lens = open_lens(kind, server.port)
+    with pytest.raises(LensError, match="in use by another program"):
+        open_lens(kind, server.port)
+    assert motor.rotor_at(CLOCK.now_ns()) == 3200.0
+    lens.close()
+    open_lens(kind, server.port).close()
+
+
+def test_unplugging_is_an_error_that_says_so(kind: str, board: Any) -> None:
+    server, _ = board
+    lens = open_lens(kind, server.port)
+    server.close()
+    with pytest.raises(LensError, match="gone"):
+        poll_until(lens, lambda _: False)
+    with pytest.raises(LensError, match="gone"):
+        lens.poll()
+    lens.close()
+
+
+def test_a_missing_port_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LensError, match="no such port"):
+        SerialPort(str(tmp_path / "ttyACM9"), 115_200)
+    with pytest.raises(ConfigError, match=r"lens\.port is empty"):
+        SerialPort("", 115_200)
+
+
+def test_a_file_is_not_a_port(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_text("hello")
+    with pytest.raises(LensError, match="cannot be opened as a serial port"):
+        SerialPort(str(tmp_path / "plain"), 115_200)
+
+
+def test_a_far_end_that_takes_no_bytes_is_an_error_and_the_way_is_cleared() -> None:
+    master, slave = os.openpty()
+    port = SerialPort(os.ttyname(slave), 115_200)
+    with pytest.raises(LensError, match="takes no bytes"):
+        fill(port)
+    port.close()
+    with pytest.raises(LensError, match="closed"):
+        port.write(b"x")
+    port.close()
+    os.close(master)
+    os.close(slave)
+
+
+def fill(port: SerialPort) -> None:
+    for _ in range(64):
+        port.write(b"x" * 4096)
+
+
+def test_what_was_written_arrives_and_what_arrived_is_read() -> None:
+    master, slave = os.openpty()
+    port = SerialPort(os.ttyname(slave), 115_200)
+    assert port.read_available() == b""
+    port.write(b"\x89\x00\xff\r\n")
+    assert os.read(master, 100) == b"\x89\x00\xff\r\n"
+    os.write(master, b"<Idle|\x00\xff\r\n")
+    assert port.read_available() == b"<Idle|\x00\xff\r\n"
+    os.close(master)
+    with pytest.raises(LensError, match="gone"):
+        port.read_available()
+    port.close()
+    os.close(slave)
+
+
+# --- elpd sim-board ----------------------------------------------------------------------------------------------
+
+
+def sim_board(*arguments: str) -> subprocess.Popen[str]:
+    program = [sys.executable, "-c", "from elpd.cli import main; main()", "sim-board", *arguments]
+    return subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_ticlib_drives_elpd_sim_board(ending: signal.Signals) -> None:
+    with sim_board("tic", "--json", "--set", "start_um=500", "--set", "board.referenced=true") as process:
+        assert process.stdout is not None
+        port = json.loads(process.stdout.readline())["port"]
+        with serial.Serial(port, 115_200, timeout=20, write_timeout=20) as line:
+            tic = ticlib.TicSerial(line)
+            assert tic.get_current_position() == 1600
+            tic.energize()
+            tic.exit_safe_start()
+            tic.set_max_speed(64_000_000)
+            tic.set_target_position(1700)
+            for _ in range(2000):
+                tic.reset_command_timeout()
+                if tic.get_current_position() == 1700:
+                    break
+            assert tic.get_current_position() == 1700
+            assert tic.get_variables()["planning_mode"] in {0, 1}
+        process.send_signal(ending)
+        out, err = process.communicate(timeout=30)
+        assert (process.returncode, out, err) == (0, "", "")
+
+
+def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
+    with sim_board("grbl") as process:
+        assert process.stdout is not None
+        port = process.stdout.readline().strip()
+        with serial.Serial(port, 115_200, timeout=20) as line:
+            line.write(b"$I\n")
+            assert line.read_until(b"ok\r\n").endswith(b"[VER:1.1h.20190825:]\r\n[OPT:V,15,128]\r\nok\r\n")
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=30)
+        assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["marlin"], "known are grbl, tic"),
+        (["tic", "--set", "nope=1"], "board.nope: unknown key"),
+        (["tic", "--set", "start_um"], "KEY=VALUE"),
+        (["tic", "--set", "start_um=9999"], "outside the travel"),
+    ],
+)
+def test_elpd_sim_board_refuses_what_it_does_not_know(arguments: list[str], words: str) -> None:
+    with sim_board(*arguments, "--json") as process:
+        out, err = process.communicate(timeout=30)
+        assert process.returncode == 2
+        assert words in err
+        assert json.loads(out)["error"]["kind"] in {"UsageError", "ConfigError"}
+        assert "Traceback" not in err

@@ -1,0 +1,58 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from elpd.vision.refractory import refractory_period_us, shortest_intervals
+
+FOREVER = np.iinfo(np.int64).max
+
+
+def slow_shortest(events: list[tuple[int, int, int]], keep: int) -> tuple[list[int], int]:
+    last: dict[tuple[int, int], int] = {}
+    intervals = []
+    for t, x, y in events:
+        if (x, y) in last and t > last[x, y]:
+            intervals.append(t - last[x, y])
+        last[x, y] = t
+    return (sorted(intervals) + [FOREVER] * keep)[:keep], len(intervals)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 50), st.integers(0, 3), st.integers(0, 2)), max_size=80),
+    st.integers(1, 9),
+    st.integers(0, 80),
+)
+def test_the_kernel_is_its_slow_twin_for_any_split(
+    steps: list[tuple[int, int, int]], keep: int, cut: int
+) -> None:
+    t = np.cumsum(np.array([step for step, _, _ in steps], np.int64))
+    x = np.array([x for _, x, _ in steps], np.uint16)
+    y = np.array([y for _, _, y in steps], np.uint16)
+    last, shortest = np.full((3, 4), -1, np.int64), np.full(keep, FOREVER)
+    count = sum(shortest_intervals(t[part], x[part], y[part], last, shortest) for part in (slice(cut), slice(cut, None)))
+    assert (shortest.tolist(), count) == slow_shortest(
+        list(zip(t.tolist(), x.tolist(), y.tolist(), strict=True)), keep
+    )
+
+
+def deaf_pixels(period_us: int, grid_us: int = 1) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16]]:
+    """Poisson events of 40x40 pixels, each deaf for a while after each."""
+    random = np.random.default_rng(3)
+    waits = random.exponential(3000.0, (1600, 30)) + period_us
+    t = (np.cumsum(waits, axis=1) // grid_us * grid_us).astype(np.int64)
+    pixel = np.repeat(np.arange(1600), 30)
+    order = np.argsort(t.ravel(), kind="stable")
+    return t.ravel()[order], (pixel % 40).astype(np.uint16)[order], (pixel // 40).astype(np.uint16)[order]
+
+
+def test_the_period_is_found_to_a_few_per_cent() -> None:
+    for period_us in (100, 500, 1500):
+        found = refractory_period_us(*deaf_pixels(period_us), (40, 40))
+        assert period_us <= found < 1.05 * period_us + 5
+
+
+def test_a_grid_of_time_stamps_or_few_events_tell_nothing() -> None:
+    assert refractory_period_us(*deaf_pixels(500, grid_us=1000), (40, 40)) == 0.0
+    t, x, y = deaf_pixels(500)
+    assert refractory_period_us(t[:2000], x[:2000], y[:2000], (40, 40)) == 0.0
