@@ -19,11 +19,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.cases import FRAME_PERIODS_US, SETS, cases_of
+from benchmarks.cases import cases_of
 from benchmarks.methods import all_methods
 from benchmarks.report import write_report
 from benchmarks.runner import EXECUTORS, Work, known_rows, run_all, wanted_pairs
 from benchmarks.scoring import scores
+from benchmarks.sets import FRAME_PERIODS_US, SETS
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -47,13 +48,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows_folder = chosen.out / "rows"
     rows_folder.mkdir(parents=True, exist_ok=True)
     cache = None if chosen.cache == "none" else Path(chosen.cache or chosen.out / "cases")
-    wanted = wanted_pairs(chosen.methods, chosen.rates)
     patterns = QUICK if chosen.quick else (chosen.cases,)
     cases = {
         case.name: case for name in chosen.sets for pattern in patterns for case in cases_of(name, chosen.seed, pattern)
     }
-    works = [Work(case, wanted, rows_folder, cache) for case in cases.values()]
-    if not works or not wanted:
+    works = [
+        Work(case, wanted_pairs(case.set_name, chosen.methods, chosen.rates), rows_folder, cache)
+        for case in cases.values()
+    ]
+    if not any(work.wanted for work in works):
         print("benchmark: no case or no method left to run; check --cases, --methods and --rates", file=sys.stderr)
         return 2
     started = time.perf_counter()
@@ -116,8 +119,9 @@ def _run(works: Sequence[Work], chosen: argparse.Namespace) -> list[Row]:
             rows.extend(some)
             progress.advance(task)
     place = {work.case.name: k for k, work in enumerate(works)}
-    pairs = {pair: k for k, pair in enumerate(works[0].wanted)}
-    return sorted(rows, key=lambda row: (place[row.case], pairs[row.method, row.rate]))
+    order = {name: k for k, name in enumerate(chosen.methods)}
+    # The sort is stable, and a case's rows come in the order of a method's rates.
+    return sorted(rows, key=lambda row: (place[row.case], order[row.method]))
 
 
 def _write(out: Path, rows: Sequence[Row], table: Sequence[Score], settings: dict[str, Any]) -> None:

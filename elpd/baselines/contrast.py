@@ -8,7 +8,7 @@ the frame rate: at 50 fps and 0.8 um/ms frames are 16 um apart. It needs the com
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     FocusMeasure = Callable[[NDArray[np.uint8], Roi], float]
 
 
-def tenengrad(pixels: NDArray[np.uint8], roi: Roi) -> float:
+def tenengrad(pixels: NDArray[np.uint8] | NDArray[np.float32], roi: Roi) -> float:
     """Return the mean squared Sobel gradient of *pixels* (height, width) inside *roi*."""
     window = _cut(pixels, roi)
     dx = cv2.Sobel(window, cv2.CV_32F, 1, 0, ksize=3)
@@ -64,5 +64,5 @@ def _highest(stack: FocusStack, measure: FocusMeasure) -> Estimate:
     return Estimate(stack.time_at_um(position_um), float(stack.end_us), details)
 
 
-def _cut(pixels: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
+def _cut(pixels: NDArray[Any], roi: Roi) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])

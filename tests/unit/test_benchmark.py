@@ -10,12 +10,13 @@ import benchmark
 import naive_baselines as naive
 import numpy as np
 import pytest
-from benchmarks.cases import SETS, Case, cases_of, load_or_make, make
-from benchmarks.methods import Row, all_methods
+from benchmarks.cases import Case, cases_of, load_or_make, make
+from benchmarks.methods import Row, all_methods, aperture_picture, run_method
 from benchmarks.optics import FocusRenderer, cubic_weights, fold_spectrum, load_psf
 from benchmarks.plots import Plot, Series, draw
-from benchmarks.retina import RETINAS, Retina, cross_thresholds, lin_log
+from benchmarks.retina import Retina, cross_thresholds, lin_log
 from benchmarks.scoring import scores
+from benchmarks.sets import APERTURE_US, MAP, SETS, STD
 from benchmarks.shake import MOTIONS, shifts_px
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,7 +32,9 @@ def test_the_table_is_sharpest_at_zero_and_ten_times_wider_at_the_ends(field_of_
     assert np.argmin(psf.rms_um) == middle
     assert np.all(np.diff(psf.rms_um[: middle + 1]) < 0)
     assert np.all(np.diff(psf.rms_um[middle:]) > 0)
-    ratios = psf.rms_um[[0, -1]] / psf.rms_um[middle]
+    # The paper's sweep ends 400 um either side of focus; the table goes on for rigs with more defocus.
+    ends = np.flatnonzero(np.abs(psf.positions_um) == 400.0)
+    ratios = psf.rms_um[ends] / psf.rms_um[middle]
     assert np.all((ratios > 9.0) & (ratios < 10.5))
 
 
@@ -122,9 +125,9 @@ def test_the_retina_is_its_twin(seed: int, refractory_us: float) -> None:
 
 
 def test_a_brightening_pixel_counts_its_thresholds() -> None:
-    settings_ = replace(RETINAS["std"], sigma_thres=0.0, shot_noise_rate_hz=0.0, leak_rate_hz=0.0, cutoff_hz=1e5)
+    settings_ = replace(STD, sigma_thres=0.0, shot_noise_rate_hz=0.0, leak_rate_hz=0.0, cutoff_hz=1e5)
     rng = np.random.default_rng(1)
-    retina = Retina(settings_, np.full((20, 20), 50.0, dtype=np.float32), 1_000_000, rng)
+    retina = Retina(settings_, np.full((20, 20), 50.0, dtype=np.float32), 0, 1_000_000, rng)
     for k in range(1, 101):
         retina.see(np.full((20, 20), 50.0 * np.exp(0.02 * k), dtype=np.float32), 10_000.0 * k)
     seen = retina.events()
@@ -155,7 +158,8 @@ def test_white_and_lasting_jitter_have_the_speed_asked_for() -> None:
 
 def test_the_set_has_the_papers_84_cases_and_patterns_choose_among_them() -> None:
     assert len(cases_of("syn", 1)) == 84
-    assert len({case.name for name in SETS for case in cases_of(name, 1)}) == 168
+    assert len(cases_of("syn-std", 1)) == 84
+    assert len({case.name for name in SETS for case in cases_of(name, 1)}) == 2 * 84 + 4 * 21
     assert [case.name for case in cases_of("syn", 1, "*-camera-fov2-static")] == ["syn-camera-fov2-static"]
 
 
@@ -176,10 +180,31 @@ def test_a_case_follows_from_its_name_and_seed_and_survives_the_cache(cache: Pat
     assert len(made.frames_at("20")) == 21
     assert [frame.t_us for frame in made.frames_at("1")] == [0]
     assert made.frame_nearest(350_000).t_us == 350_000
-    assert made.truth_us == 500_000.0
+    assert case.of_set.truth_us == 500_000.0
+    assert abs(made.sharpest_um) < 2.0
     # Sharpest where the truth says.
     edges = (np.diff(made.frames.astype(np.float64), axis=2) ** 2).mean(axis=(1, 2))
     assert abs(int(np.argmax(edges)) - 50) <= 1
+
+
+def test_an_opening_aperture_leaves_a_picture_and_one_event_a_pixel(cache: Path) -> None:
+    made = load_or_make(Case("evk4-bright", "camera", 1, "static", 3), cache)
+    opening = made.t_us < APERTURE_US
+    pixels = made.geometry.width * made.geometry.height
+    assert 0.9 * pixels < np.count_nonzero(made.on[opening]) < 1.1 * pixels
+    picture = aperture_picture(made)
+    # What the picture shows is the scene as the lens sees it before it moves.
+    before = np.log(made.frame_nearest(APERTURE_US).pixels.astype(np.float64) + 1.0)
+    assert np.corrcoef(before[picture.valid], picture.log_intensity[picture.valid])[0, 1] > 0.9
+    # Peers see the sweep alone; time goes on counting from the opening.
+    stack = made.stack(())
+    assert stack.begin_us == 25_000
+    assert stack.t_us[0] >= 25_000
+    assert made.path().at(stack.begin_us) == -200.0
+    assert made.path().at(made.case.of_set.truth_us) == pytest.approx(0.0)
+    found = run_method(all_methods()["elpd"], MAP, made)
+    assert found.error_um is not None
+    assert abs(found.error_um) < 6.0
 
 
 # --- scores and report -------------------------------------------------------------------------------------------
@@ -188,7 +213,7 @@ def test_a_case_follows_from_its_name_and_seed_and_survives_the_cache(cache: Pat
 def row(error_um: float | None, decided_um: float = 30.0) -> Row:
     return Row(
         "syn-a-fov1-static", "syn", "a", 1, "static", "pbf", "-", 100, error_um, None if error_um is None else 2.0,
-        None if error_um is None else decided_um, 500.0, 3.0, "", {},
+        None if error_um is None else decided_um, 500.0, 1.0, 3.0, "", {},
     )  # fmt: skip
 
 

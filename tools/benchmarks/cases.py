@@ -1,9 +1,4 @@
-"""The cases of a benchmark set, how each is made, and where it is kept.
-
-``syn`` is the paper's synthetic set built again: 7 scenes x 4 fields of view x 3 motions = 84 sweeps of one second
-from -400 to +400 um, 200 x 200 pixels, frames at 1, 20 and 50 fps, in the reading that reproduces the paper's table
-(threshold 0.05, motion in pixels of the 600 x 600 picture). ``syn-std`` is the same with v2e's default threshold of
-0.2 and motion in the sensor's pixels, which is harder. Frames are instantaneous and noise-free, as in the paper.
+"""One case of a benchmark set: how it is made, what it holds, and where it is kept.
 
 A case follows from its name and the seed alone, whichever process makes it and in whatever order.
 """
@@ -19,10 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.optics import FocusRenderer, load_psf
-from benchmarks.retina import RETINAS, Retina
+from benchmarks.retina import Retina, RetinaEvents, joined
 from benchmarks.scenes import SCENES, load_picture
+from benchmarks.sets import APERTURE_US, FRAME_PERIODS_US, SETS, CaseSet
 from benchmarks.shake import MOTIONS, shifts_px
 from elpd.baselines import FocusStack, LensPath, StackFrame
+from elpd.baselines.contrast import tenengrad
+from elpd.baselines.rates import vertex
 from elpd.records import Geometry, Roi
 
 if TYPE_CHECKING:
@@ -31,40 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-GENERATION = 2
+GENERATION = 3
 """Raised whenever the same name and seed would give other events, so that stale files are not used."""
-
-START_UM = -400.0
-SPEED_UM_S = 800.0
-FRAMES = 1001
-FRAME_US = 1_000
-KEEP_EVERY_US = 10_000
-"""Frames kept with a case: enough for 50, 20 and 1 fps, and for the frame at 350 ms that the paper's code looks ahead
-to."""
-SIZE_PX = 200
-MARGIN_PX = 8
-ROI = Roi(10, 10, 180, 180)
-DEPTH_OF_FOCUS_UM = 16.0
-
-FRAME_PERIODS_US = {"50": 20_000, "20": 50_000, "1": 1_000_000}
-"""Frame rates by name; at 1 fps there is the first frame and no other."""
-
-
-@dataclass(frozen=True, slots=True)
-class CaseSet:
-    """What is common to a set: the retina and how large a pixel of motion is in pixels of the sensor."""
-
-    name: str
-    retina: str
-    motion_px: float
-    motions: tuple[str, ...] = ("static", "moderate", "violent")
-    fields: tuple[int, ...] = (1, 2, 3, 4)
-
-
-SETS = {
-    "syn": CaseSet("syn", "c05", 1.0 / 3.0),
-    "syn-std": CaseSet("syn-std", "std", 1.0),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +48,20 @@ class Case:
         """The name in tables, files and ``--cases`` patterns."""
         return f"{self.set_name}-{self.scene}-fov{self.fov}-{self.motion}"
 
+    @property
+    def of_set(self) -> CaseSet:
+        """The set it belongs to."""
+        return SETS[self.set_name]
+
 
 @dataclass(frozen=True, slots=True)
 class SweepRecording:
-    """A sweep and its truth. Frames (n, 200, 200) ``uint8`` were taken at ``frame_t_us`` (n,)."""
+    """A sweep and its truth. Frames (n, size, size) ``uint8`` were taken at ``frame_t_us`` (n,).
+
+    ``sharpest_um`` is where the noise-free picture of this scene has its highest contrast. Off the axis that is not
+    where the PSF has its least RMS radius, which is what the paper and the tables call truth: the difference is a limit
+    to what any method that looks at pictures can reach.
+    """
 
     case: Case
     t_us: NDArray[np.int64]
@@ -94,11 +70,17 @@ class SweepRecording:
     on: NDArray[np.uint8]
     frame_t_us: NDArray[np.int64]
     frames: NDArray[np.uint8]
+    sharpest_um: float
 
     @property
-    def truth_us(self) -> float:
-        """When the PSF had its least RMS radius."""
-        return -START_UM / SPEED_UM_S * 1e6
+    def geometry(self) -> Geometry:
+        """The simulated part of the sensor."""
+        return Geometry(self.case.of_set.size_px, self.case.of_set.size_px)
+
+    @property
+    def roi(self) -> Roi:
+        """The region of interest: all but a border."""
+        return region(self.case.of_set)
 
     def frames_at(self, rate: str) -> tuple[StackFrame, ...]:
         """Return the frames of a camera that delivers *rate* of them per second."""
@@ -112,13 +94,34 @@ class SweepRecording:
         k = int(np.argmin(np.abs(self.frame_t_us - t_us)))
         return StackFrame(int(self.frame_t_us[k]), self.frames[k])
 
+    def path(self) -> LensPath:
+        """Return where the lens was."""
+        chosen = self.case.of_set
+        knots_us = sorted({0.0, float(chosen.sweep_begin_us), float(chosen.end_us)})
+        return LensPath(np.array(knots_us), np.array([chosen.position_um(t_us) for t_us in knots_us]))
+
     def stack(self, frames: Sequence[StackFrame]) -> FocusStack:
-        """Return the sweep as the peers see it, with *frames*."""
-        end_us = (FRAMES - 1) * FRAME_US
-        ends_us = np.array([0.0, float(end_us)])
-        path = LensPath(ends_us, START_UM + SPEED_UM_S * ends_us / 1e6)
-        geometry = Geometry(SIZE_PX, SIZE_PX)
-        return FocusStack(self.t_us, self.x, self.y, self.on, geometry, ROI, 0, end_us, tuple(frames), path)
+        """Return the sweep, without what an aperture made before it, as the peers see it."""
+        chosen = self.case.of_set
+        first = int(np.searchsorted(self.t_us, chosen.sweep_begin_us))
+        return FocusStack(
+            self.t_us[first:],
+            self.x[first:],
+            self.y[first:],
+            self.on[first:],
+            self.geometry,
+            self.roi,
+            chosen.sweep_begin_us,
+            chosen.end_us,
+            tuple(frames),
+            self.path(),
+        )
+
+
+def region(chosen: CaseSet) -> Roi:
+    """Return the region of interest of a set."""
+    side = chosen.size_px - 2 * chosen.border_px
+    return Roi(chosen.border_px, chosen.border_px, side, side)
 
 
 def cases_of(set_name: str, seed: int, pattern: str = "*") -> list[Case]:
@@ -134,30 +137,46 @@ def cases_of(set_name: str, seed: int, pattern: str = "*") -> list[Case]:
 
 
 def make(case: Case) -> SweepRecording:
-    """Render and record *case*; 3 to 5 s of one core."""
-    chosen = SETS[case.set_name]
-    # Motion and sensor have streams of their own, so that a change to one leaves the other as it was.
+    """Render and record *case*; some seconds of one core."""
+    chosen = case.of_set
+    # Motion, sensor and frames have streams of their own, so that a change to one leaves the others as they were.
     entropy = [case.seed, zlib.crc32(case.name.encode())]
-    motion_rng, retina_rng = (np.random.default_rng(child) for child in np.random.SeedSequence(entropy).spawn(2))
-    side = 3 * (SIZE_PX + 2 * MARGIN_PX)
-    renderer = FocusRenderer(load_picture(case.scene, side), load_psf(case.fov), MARGIN_PX)
-    moved = chosen.motion_px * shifts_px(MOTIONS[case.motion], FRAMES, FRAME_US / 1e3, motion_rng)
+    motion_rng, retina_rng, frame_rng = (np.random.default_rng(c) for c in np.random.SeedSequence(entropy).spawn(3))
+    side = 3 * (chosen.size_px + 2 * chosen.margin_px)
+    renderer = FocusRenderer(load_picture(case.scene, side), load_psf(case.fov), chosen.margin_px)
+    times_us = range(0, chosen.end_us + 1, chosen.step_us)
+    moved = chosen.motion_px * shifts_px(MOTIONS[case.motion], len(times_us), chosen.step_us / 1e3, motion_rng)
+    aperture: Retina | None = None
     retina: Retina | None = None
-    kept_t_us, kept = [], []
-    for k in range(FRAMES):
-        t_us = k * FRAME_US
-        image = renderer.frame(START_UM + SPEED_UM_S * t_us / 1e6, (float(moved[k, 0]), float(moved[k, 1])))
-        np.clip(image, 0.0, 255.0, out=image)
+    kept_t_us, kept, edges = [], [], []
+    for t_us, shift in zip(times_us, moved, strict=True):
+        position_um = chosen.defocus_per_um * chosen.position_um(t_us)
+        image = np.clip(renderer.frame(position_um, (float(shift[0]), float(shift[1]))), 0.0, 255.0)
+        if chosen.expose is not None and t_us <= APERTURE_US:
+            dimmed = image * np.float32(t_us / APERTURE_US)
+            if aperture is None:
+                aperture = Retina(chosen.expose, dimmed, 0, APERTURE_US, retina_rng)
+            else:
+                aperture.see(dimmed, float(t_us))
+            if t_us < APERTURE_US:
+                continue
         if retina is None:
-            retina = Retina(RETINAS[chosen.retina], image, (FRAMES - 1) * FRAME_US, retina_rng)
+            retina = Retina(chosen.retina, image, t_us, chosen.end_us, retina_rng)
         else:
             retina.see(image, float(t_us))
-        if t_us % KEEP_EVERY_US == 0:
+        if t_us % chosen.keep_every_us == 0:
             kept_t_us.append(t_us)
-            kept.append(np.round(image).astype(np.uint8))
+            edges.append(tenengrad(image, region(chosen)))
+            noisy = image + chosen.frame_noise_dn * frame_rng.standard_normal(image.shape)
+            kept.append(np.round(np.clip(noisy, 0.0, 255.0)).astype(np.uint8))
     assert retina is not None
-    seen = retina.events()
-    return SweepRecording(case, seen.t_us, seen.x, seen.y, seen.on, np.array(kept_t_us), np.stack(kept))
+    parts: list[RetinaEvents] = [one.events() for one in (aperture, retina) if one is not None]
+    seen = joined(parts)
+    sharpest = vertex(np.array(edges), int(np.argmax(edges)))
+    sharpest_us = float(np.interp(sharpest, np.arange(len(kept_t_us)), kept_t_us))
+    return SweepRecording(
+        case, seen.t_us, seen.x, seen.y, seen.on, np.array(kept_t_us), np.stack(kept), chosen.position_um(sharpest_us)
+    )
 
 
 def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
@@ -167,11 +186,9 @@ def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
     path = cache / f"{case.name}-seed{case.seed}-g{GENERATION}.npz"
     if path.is_file():
         with np.load(path) as kept:
-            return SweepRecording(
-                case,
-                kept["t_us"].astype(np.int64),
-                *(kept[name] for name in ("x", "y", "on", "frame_t_us", "frames")),
-            )
+            columns = {name: kept[name] for name in ("x", "y", "on", "frame_t_us", "frames")}
+            sharpest_um = float(kept["sharpest_um"])
+            return SweepRecording(case, kept["t_us"].astype(np.int64), **columns, sharpest_um=sharpest_um)
     made = make(case)
     cache.mkdir(parents=True, exist_ok=True)
     # Written aside and renamed: an interrupted run leaves no half a case under the name.
@@ -184,6 +201,7 @@ def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
         on=made.on,
         frame_t_us=made.frame_t_us,
         frames=made.frames,
+        sharpest_um=made.sharpest_um,
     )
     aside.replace(path)
     return made

@@ -7,7 +7,7 @@ traced with ``optiland``, which is a development tool and no dependency of anyth
     python -m venv .trace && .trace/bin/pip install optiland && .trace/bin/python tools/benchmarks/make_psf_table.py
 
 For each of four image heights, from the axis to the corner of a DAVIS346, rays of three wavelengths are followed to a
-plane, carried on to planes over ±400 um about the one of least RMS radius, and counted in cells of a third of that
+plane, carried on to planes over ±544 um about the one of least RMS radius, and counted in cells of a third of that
 sensor's pixel. Two liberties, both the paper's as well: each field is focused for itself (field curvature would move
 its truth), and each spot is centred on its centroid (no focus breathing). Vignetting is not traced: within 4.6 degrees
 the rims of this lens cut nothing.
@@ -45,8 +45,8 @@ WAVELENGTHS = ((0.4861, 0.5), (0.5876, 1.0), (0.6563, 0.5))
 IMAGE_HEIGHTS_MM = (0.0, 4.0 / 3.0, 8.0 / 3.0, 4.0)
 """Axis to the corner of a DAVIS346 (346 x 260 pixels of 18.5 um)."""
 CELL_UM = 18.5 / 3.0
-CELLS = 41
-REACH_UM = 400.0
+CELLS = 55
+REACH_UM = 544.0
 STEP_UM = 8.0
 RAYS_ACROSS = 900
 

@@ -13,27 +13,33 @@ import time
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.cases import DEPTH_OF_FOCUS_UM, ROI, SIZE_PX, SPEED_UM_S
-from elpd.baselines import PEERS
+import numpy as np
+
+from benchmarks.sets import APERTURE_US, MAP
+from elpd.baselines import PEERS, StackFrame
 from elpd.record.layouts import RecordedSweep
 from elpd.record.sweep_file import SweepSearch
-from elpd.records import Geometry, Outcome
+from elpd.records import Outcome
+from elpd.units import SensorUs
+from elpd.vision.first_events import FirstEventMap
+from elpd.vision.pictures import display
+from elpd.vision.reference import reference_from_temporal_image
 from elpd.vision.ruler import Ruler
+from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from benchmarks.cases import SweepRecording
-    from elpd.baselines import StackFrame
+    from elpd.records import TemporalImage
 
 OURS = "elpd"
 NO_FRAMES = "-"
 """The frame rate of a method that sees events only."""
-_AHEAD_US = 350_000
+_AHEAD = 0.35
+"""Where in the sweep the released "1 fps" program takes its one frame: a frame from the future."""
 _CURVES_OF = (("elp-syn", "50"), ("elp-syn-1fps", "1"))
 """Only these curves are kept; the report draws some of them, and all would make the results ten times larger."""
-_UM_PER_US = SPEED_UM_S / 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +56,9 @@ class Method:
 class Row:
     """One method on one case. ``None`` where there is no answer.
 
-    ``error_um`` is estimate less truth, ``decided_um`` how far past focus the lens was when the answer could be given,
-    ``focusing_ms`` the time from the start of the sweep until the lens could be back at the estimate, without braking.
+    ``error_um`` is estimate less truth, ``sharpest_um`` where the picture itself is sharpest, on the same ruler,
+    ``decided_um`` how far past focus the lens was when the answer could be given, ``focusing_ms`` the time from the
+    start of the sweep until the lens could be back at the estimate, without braking.
     """
 
     case: str
@@ -66,6 +73,7 @@ class Row:
     sigma_um: float | None
     decided_um: float | None
     focusing_ms: float | None
+    sharpest_um: float
     cpu_ms: float
     reason: str
     details: dict[str, Any] = field(default_factory=dict)
@@ -77,7 +85,7 @@ class Row:
 
 def all_methods() -> dict[str, Method]:
     """Return every method by name, ours first."""
-    methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", NO_FRAMES))}
+    methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, NO_FRAMES))}
     for name, peer in PEERS.items():
         if not peer.needs_frames:
             rates: tuple[str, ...] = (NO_FRAMES,)
@@ -85,18 +93,25 @@ def all_methods() -> dict[str, Method]:
             rates = ("1",)
         else:
             # One frame has no contrast to compare with, and the released programs at 1 fps are the method above.
-            rates = ("50", "20")
+            rates = ("50", "20", MAP) if name == "elp-evk4" else ("50", "20")
         methods[name] = Method(name, peer.title, peer.sees, rates)
     return methods
 
 
 def run_method(method: Method, rate: str, recording: SweepRecording) -> Row:
     """Run *method* on *recording* with frames at *rate*."""
-    frames = () if rate == NO_FRAMES else recording.frames_at(rate)
+    picture = aperture_picture(recording) if rate == MAP else None
+    if picture is not None:
+        grey = display(picture.log_intensity, picture.valid)
+        frames: tuple[StackFrame, ...] = (StackFrame(recording.case.of_set.sweep_begin_us, grey),)
+    else:
+        frames = () if rate == NO_FRAMES else recording.frames_at(rate)
     if method.name == OURS:
-        return _run_ours(recording, rate, frames)
+        return _run_ours(recording, rate, () if picture is not None else frames, picture)
     if method.name == "elp-syn-1fps":
-        frames = (recording.frame_nearest(_AHEAD_US),)
+        chosen = recording.case.of_set
+        ahead_us = chosen.sweep_begin_us + _AHEAD * (chosen.end_us - chosen.sweep_begin_us)
+        frames = (recording.frame_nearest(ahead_us),)
     stack = recording.stack(frames)
     started = time.process_time()
     answer = PEERS[method.name].run(stack)
@@ -129,19 +144,38 @@ class _HeldFrame:
         return self.pixels
 
 
-def _run_ours(recording: SweepRecording, rate: str, frames: tuple[StackFrame, ...]) -> Row:
+def aperture_picture(recording: SweepRecording) -> TemporalImage:
+    """Return the picture that the events of the opening aperture give."""
+    first = FirstEventMap(recording.geometry, 0, APERTURE_US)
+    stop = int(np.searchsorted(recording.t_us, APERTURE_US))
+    first.add(recording.t_us[:stop], recording.x[:stop], recording.y[:stop], recording.on[:stop])
+    return temporal_image(first.believed(), read_transmittance("linear"), SensorUs(0))
+
+
+def _run_ours(
+    recording: SweepRecording, rate: str, frames: tuple[StackFrame, ...], picture: TemporalImage | None
+) -> Row:
     held = tuple(_HeldFrame(frame.t_us, frame.pixels) for frame in frames)
     sweep = RecordedSweep(
         recording.t_us,
         recording.x,
         recording.y,
         recording.on,
-        Geometry(SIZE_PX, SIZE_PX),
-        ROI,
+        recording.geometry,
+        recording.roi,
         held,  # type: ignore[arg-type]  # same shape as FrameFile: t_us and load()
     )
     started = time.process_time()
-    search = SweepSearch(sweep, ROI, Ruler.of_speed(SPEED_UM_S), depth_of_focus_um=DEPTH_OF_FOCUS_UM)
+    chosen = recording.case.of_set
+    path = recording.path()
+    search = SweepSearch(
+        sweep,
+        recording.roi,
+        Ruler.of_path(path.t_us, path.position_um),
+        depth_of_focus_um=chosen.depth_of_focus_um,
+        begin_us=chosen.sweep_begin_us,
+        reference=None if picture is None else reference_from_temporal_image(picture, recording.roi),
+    )
     found = search.run()
     cpu_ms = 1e3 * (time.process_time() - started)
     focused = found.outcome is Outcome.FOCUSED
@@ -182,11 +216,14 @@ def _row(
     details: dict[str, Any],
 ) -> Row:
     case = recording.case
+    chosen = case.of_set
     focusing_ms = math.nan
     if math.isfinite(focus_us):
         # A decision after the sweep is taken where the sweep ended; the way back is driven at the sweep's speed.
-        end_us = float(recording.frame_t_us[-1])
-        focusing_ms = (decided_us + abs(min(decided_us, end_us) - focus_us)) / 1e3 + cpu_ms * (decided_us >= end_us)
+        there_us = min(decided_us, chosen.end_us)
+        focusing_ms = (decided_us - chosen.sweep_begin_us + abs(there_us - focus_us)) / 1e3
+        if decided_us >= chosen.end_us:
+            focusing_ms += cpu_ms
         if "search_us" in details:
             focusing_ms = details["search_us"] / 1e3
     return Row(
@@ -198,9 +235,10 @@ def _row(
         method=method,
         rate=rate,
         events=int(recording.t_us.size),
-        error_um=_or_none((focus_us - recording.truth_us) * _UM_PER_US),
-        sigma_um=_or_none(sigma_us * _UM_PER_US),
-        decided_um=_or_none((decided_us - recording.truth_us) * _UM_PER_US) if math.isfinite(focus_us) else None,
+        error_um=_or_none((focus_us - chosen.truth_us) * chosen.um_per_us),
+        sigma_um=_or_none(sigma_us * chosen.um_per_us),
+        decided_um=_or_none((decided_us - chosen.truth_us) * chosen.um_per_us) if math.isfinite(focus_us) else None,
+        sharpest_um=round(recording.sharpest_um, 4),
         focusing_ms=_or_none(focusing_ms),
         cpu_ms=round(cpu_ms, 3),
         reason=reason,

@@ -22,6 +22,8 @@ import numpy as np
 from elpd.events.jit import kernel
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 LINEAR_BELOW = 20.0
@@ -32,7 +34,7 @@ _DARK_NOISE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class RetinaSettings:
-    """v2e's parameters, under v2e's names."""
+    """v2e's parameters, under v2e's names. A ``settled`` sensor starts with every reference at its level."""
 
     pos_thres: float
     neg_thres: float
@@ -41,13 +43,7 @@ class RetinaSettings:
     leak_rate_hz: float = 0.01
     shot_noise_rate_hz: float = 0.001
     refractory_period_s: float = 0.0005
-
-
-RETINAS = {
-    # The setting under which the paper's code reproduces the paper's table (third-party finding), and v2e's defaults.
-    "c05": RetinaSettings(0.05, 0.05, 0.01),
-    "std": RetinaSettings(0.2, 0.2, 0.03),
-}
+    settled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +60,12 @@ class Retina:
     """Turns frames into events, one frame interval at a time."""
 
     def __init__(
-        self, settings: RetinaSettings, first: NDArray[np.float32], duration_us: int, rng: np.random.Generator
+        self,
+        settings: RetinaSettings,
+        first: NDArray[np.float32],
+        begin_us: int,
+        end_us: int,
+        rng: np.random.Generator,
     ) -> None:
         if settings.refractory_period_s < 5e-5:
             raise ValueError(f"refractory_period_s must be 50 us or more; got {settings.refractory_period_s}")
@@ -77,24 +78,24 @@ class Retina:
             rng.normal((settings.pos_thres, settings.neg_thres), settings.sigma_thres, (pixels, 2)), LEAST_THRESHOLD
         )
         self._level = lin_log(first.ravel().astype(np.float64))
-        leftover = rng.uniform(-1.0, 1.0, pixels)
+        leftover = np.zeros(pixels) if settings.settled else rng.uniform(-1.0, 1.0, pixels)
         self._reference = self._level - np.where(
             leftover > 0.0, leftover * self._thresholds[:, 0], leftover * self._thresholds[:, 1]
         )
         self._busy_until_us = np.full(pixels, -1.0)
-        self._t_us = 0.0
-        self._noise_t_us, self._noise_pixel, self._noise_on = self._draw_noise(first, duration_us, rng)
+        self._t_us = float(begin_us)
+        self._noise_t_us, self._noise_pixel, self._noise_on = self._draw_noise(first, begin_us, end_us, rng)
         self._noise_next = 0
         self._parts: list[RetinaEvents] = []
 
     def _draw_noise(
-        self, first: NDArray[np.float32], duration_us: int, rng: np.random.Generator
+        self, first: NDArray[np.float32], begin_us: int, end_us: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.uint8]]:
         """Draw all shot noise: Poisson in time, thinned by brightness, either polarity alike."""
         rate = self._settings.shot_noise_rate_hz * (1.0 - (1.0 - _DARK_NOISE) * _relative(first.ravel()))
-        counts = rng.poisson(rate * duration_us / 1e6)
+        counts = rng.poisson(rate * (end_us - begin_us) / 1e6)
         pixel = np.repeat(np.arange(counts.size), counts)
-        t_us = rng.uniform(0.0, duration_us, pixel.size)
+        t_us = rng.uniform(begin_us, end_us, pixel.size)
         order = np.argsort(t_us, kind="stable")
         on = rng.integers(0, 2, pixel.size, dtype=np.uint8)
         return t_us[order], pixel[order].astype(np.int64), on
@@ -130,16 +131,20 @@ class Retina:
 
     def events(self) -> RetinaEvents:
         """Return everything so far."""
-        empty = RetinaEvents(
-            np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8)
-        )
-        parts = self._parts or [empty]
-        return RetinaEvents(
-            np.concatenate([part.t_us for part in parts]),
-            np.concatenate([part.x for part in parts]),
-            np.concatenate([part.y for part in parts]),
-            np.concatenate([part.on for part in parts]),
-        )
+        return joined(self._parts)
+
+
+def joined(parts: Sequence[RetinaEvents]) -> RetinaEvents:
+    """Return the events of *parts*, which follow each other in time, as one."""
+    if not parts:
+        nothing = np.empty(0, dtype=np.int64)
+        return RetinaEvents(nothing, nothing.astype(np.uint16), nothing.astype(np.uint16), nothing.astype(np.uint8))
+    return RetinaEvents(
+        np.concatenate([part.t_us for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.on for part in parts]),
+    )
 
 
 def lin_log(intensity: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from benchmarks.cases import GENERATION, load_or_make
-from benchmarks.methods import Row, all_methods, run_method
+from benchmarks.methods import NO_FRAMES, Row, all_methods, run_method
+from benchmarks.sets import MAP, SETS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -39,10 +40,11 @@ class Work:
         return self.rows_folder / f"{self.case.name}-seed{self.case.seed}.json"
 
 
-def wanted_pairs(methods: Sequence[str], rates: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Return the (method, rate) pairs to run; methods without frames run whatever *rates* says."""
+def wanted_pairs(set_name: str, methods: Sequence[str], rates: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Return the (method, rate) pairs to run on a set; what needs no frames runs whatever *rates* says."""
     known = all_methods()
-    return tuple((name, rate) for name in methods for rate in known[name].rates if rate == "-" or rate in rates)
+    there = [rate for rate in SETS[set_name].rates if rate in rates or rate == MAP]
+    return tuple((name, rate) for name in methods for rate in known[name].rates if rate == NO_FRAMES or rate in there)
 
 
 def known_rows(work: Work) -> list[Row]:

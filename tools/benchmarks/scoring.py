@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.cases import DEPTH_OF_FOCUS_UM
 from benchmarks.published import published_mae_um, rerun_mae_um
+from benchmarks.sets import SETS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -25,7 +25,8 @@ class Score:
     """One method at one frame rate over the cases of one set and motion; lengths in um, ``None`` without answers.
 
     ``missed`` had no answer, ``outside`` one more than a depth of focus from the truth, ``early`` a decision more than
-    a depth of focus before it. ``spread`` is the RMS of error over claimed sigma; honest sigmas make it one.
+    a depth of focus before it. ``to_sharpest_um`` is the MAE against the sharpest picture. ``spread`` is the RMS of
+    error over claimed sigma; honest sigmas make it one.
     """
 
     set_name: str
@@ -39,6 +40,7 @@ class Score:
     mae_um: float | None
     bias_um: float | None
     worst_um: float | None
+    to_sharpest_um: float | None
     decided_um: float | None
     focusing_ms: float | None
     cpu_ms: float
@@ -61,10 +63,12 @@ def scores(rows: Iterable[Row]) -> list[Score]:
 
 def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
     set_name, motion, method, rate = key
+    limit_um = SETS[set_name].depth_of_focus_um
     errors = np.array([row.error_um for row in rows if row.error_um is not None], dtype=np.float64)
     decided = np.array([row.decided_um for row in rows if row.decided_um is not None], dtype=np.float64)
     focusing = np.array([row.focusing_ms for row in rows if row.focusing_ms is not None], dtype=np.float64)
     claimed = np.array([row.error_um / row.sigma_um for row in rows if row.error_um is not None and row.sigma_um])
+    apart = np.array([row.error_um - row.sharpest_um for row in rows if row.error_um is not None])
     answered = errors.size > 0
     return Score(
         set_name=set_name,
@@ -73,11 +77,12 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
         rate=rate,
         cases=len(rows),
         missed=len(rows) - errors.size,
-        outside=int((np.abs(errors) > DEPTH_OF_FOCUS_UM).sum()),
-        early=int((decided < -DEPTH_OF_FOCUS_UM).sum()),
+        outside=int((np.abs(errors) > limit_um).sum()),
+        early=int((decided < -limit_um).sum()),
         mae_um=round(float(np.abs(errors).mean()), 3) if answered else None,
         bias_um=round(float(errors.mean()), 3) if answered else None,
         worst_um=round(float(np.abs(errors).max()), 3) if answered else None,
+        to_sharpest_um=round(float(np.abs(apart).mean()), 3) if answered else None,
         decided_um=round(float(np.median(decided)), 2) if decided.size else None,
         focusing_ms=round(float(np.median(focusing)), 1) if focusing.size else None,
         cpu_ms=round(float(np.median([row.cpu_ms for row in rows])), 2),

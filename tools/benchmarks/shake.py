@@ -3,8 +3,8 @@
 The paper draws a velocity anew for every frame of 1 ms, normal about a slow drift, and lets the translations add up.
 Its text leaves open whether pixels are the sensor's or those of the three times finer picture; here they are the
 sensor's, and a case set may scale them to the other reading, which is three times gentler. White velocity of 100 px/s
-is only 0.1 px per millisecond and a random walk of about 3 px in a second: ``shake`` adds what a hand does, a velocity
-of the same size that lasts for 30 ms.
+is only 0.1 px per millisecond and a random walk of about 3 px in a second: ``shake`` is what a trembling hand does, a
+velocity of the same size that lasts for 30 ms, and ``dynamic`` what a steady one does.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ MOTIONS = {
     "static": Motion(0.0, 0.0),
     "moderate": Motion(3.0, 20.0),
     "violent": Motion(3.0, 100.0),
+    "dynamic": Motion(0.0, 30.0, lasts_ms=50.0),
     "shake": Motion(0.0, 100.0, lasts_ms=30.0),
 }
 
