@@ -4,6 +4,7 @@
     python tools/benchmark.py --out results --quick               # six cases, to see that it works
     python tools/benchmark.py --out results --resume              # go on where it was interrupted
     python tools/benchmark.py --out results --sets syn,syn-std --methods elpd,pbf --jobs 2
+    python tools/benchmark.py --out results --sets none --recorded ../shared/sweeps
 
 The folder holds rows.csv (one line per case, method and frame rate), scores.csv, results.json (both, with the settings)
 and report.html, one file with everything in it. Cases are kept under --cache and made only once.
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.cases import cases_of
 from benchmarks.methods import all_methods
+from benchmarks.recorded import recorded_cases
 from benchmarks.report import write_report
 from benchmarks.runner import EXECUTORS, Work, known_rows, run_all, wanted_pairs
 from benchmarks.scoring import scores
@@ -48,10 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows_folder = chosen.out / "rows"
     rows_folder.mkdir(parents=True, exist_ok=True)
     cache = None if chosen.cache == "none" else Path(chosen.cache or chosen.out / "cases")
+    sets = [name for name in chosen.sets if name != "none"]
     patterns = QUICK if chosen.quick else (chosen.cases,)
-    cases = {
-        case.name: case for name in chosen.sets for pattern in patterns for case in cases_of(name, chosen.seed, pattern)
-    }
+    cases = {case.name: case for name in sets for pattern in patterns for case in cases_of(name, chosen.seed, pattern)}
+    if chosen.recorded is not None:
+        cases |= {case.name: case for case in recorded_cases(chosen.recorded)}
     works = [
         Work(case, wanted_pairs(case.set_name, chosen.methods, chosen.rates), rows_folder, cache)
         for case in cases.values()
@@ -81,7 +84,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--executor", choices=EXECUTORS, default="joblib")
     parser.add_argument("--seed", type=int, default=1, help="of motion and sensor noise (default 1)")
-    parser.add_argument("--sets", type=_names(SETS), default=["syn"], help=f"of {', '.join(SETS)} (default syn)")
+    made = [name for name, one in SETS.items() if one.motions] + ["none"]
+    parser.add_argument("--sets", type=_names(made), default=["syn"], help=f"of {', '.join(made)} (default syn)")
+    parser.add_argument("--recorded", type=Path, metavar="DIR", help="folder of recorded sweeps with truth, besides")
     every = all_methods()
     parser.add_argument(
         "--methods", type=_names(every), default=list(every), help=f"of {', '.join(every)} (default all)"

@@ -14,12 +14,14 @@ from benchmarks.cases import Case, cases_of, load_or_make, make
 from benchmarks.methods import Row, all_methods, aperture_picture, run_method
 from benchmarks.optics import FocusRenderer, cubic_weights, fold_spectrum, load_psf
 from benchmarks.plots import Plot, Series, draw
+from benchmarks.recorded import read_recorded, recorded_cases
 from benchmarks.retina import Retina, cross_thresholds, lin_log
 from benchmarks.scoring import scores
 from benchmarks.sets import APERTURE_US, MAP, SETS, STD
 from benchmarks.shake import MOTIONS, shifts_px
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared import SHARED, needs_shared
 
 # --- the lens ----------------------------------------------------------------------------------------------------
 
@@ -205,6 +207,19 @@ def test_an_opening_aperture_leaves_a_picture_and_one_event_a_pixel(cache: Path)
     found = run_method(all_methods()["elpd"], MAP, made)
     assert found.error_um is not None
     assert abs(found.error_um) < 6.0
+
+
+@needs_shared
+def test_third_party_sweeps_are_read_with_their_frames_and_truth() -> None:
+    cases = recorded_cases(SHARED / "sweeps")
+    assert {case.motion for case in cases} == {"static", "moderate", "violent"}
+    made = read_recorded(cases[0])
+    assert made.case.folder is not None
+    assert made.truth_us == json.loads((made.case.folder / "truth.json").read_text())["gt_us"]
+    assert 48 <= len(made.frames_at("50")) <= 52
+    assert 20 <= len(made.frames_at("20")) <= 22
+    assert made.frame_nearest(350_000).t_us == pytest.approx(350_000, abs=2_000)
+    assert np.all(np.diff(made.t_us) >= 0)
 
 
 # --- scores and report -------------------------------------------------------------------------------------------

@@ -35,13 +35,14 @@ GENERATION = 3
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One sweep to be made."""
+    """One sweep: to be made, or where it is recorded in ``folder``."""
 
     set_name: str
     scene: str
     fov: int
     motion: str
     seed: int
+    folder: Path | None = None
 
     @property
     def name(self) -> str:
@@ -56,7 +57,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class SweepRecording:
-    """A sweep and its truth. Frames (n, size, size) ``uint8`` were taken at ``frame_t_us`` (n,).
+    """A sweep and its truth, the time in focus. Frames (n, size, size) ``uint8`` were taken at ``frame_t_us`` (n,).
 
     ``sharpest_um`` is where the noise-free picture of this scene has its highest contrast. Off the axis that is not
     where the PSF has its least RMS radius, which is what the paper and the tables call truth: the difference is a limit
@@ -71,6 +72,7 @@ class SweepRecording:
     frame_t_us: NDArray[np.int64]
     frames: NDArray[np.uint8]
     sharpest_um: float
+    truth_us: float
 
     @property
     def geometry(self) -> Geometry:
@@ -84,10 +86,12 @@ class SweepRecording:
 
     def frames_at(self, rate: str) -> tuple[StackFrame, ...]:
         """Return the frames of a camera that delivers *rate* of them per second."""
-        chosen = np.flatnonzero(self.frame_t_us % FRAME_PERIODS_US[rate] == 0)
+        wanted_us = np.arange(0, self.case.of_set.end_us + 1, FRAME_PERIODS_US[rate])
         if rate == "1":
-            chosen = chosen[:1]
-        return tuple(StackFrame(int(self.frame_t_us[k]), self.frames[k]) for k in chosen)
+            wanted_us = wanted_us[:1]
+        # Recorded frames keep their own times, about as far apart as the rate says.
+        nearest = np.unique(np.argmin(np.abs(self.frame_t_us[None, :] - wanted_us[:, None]), axis=1))
+        return tuple(StackFrame(int(self.frame_t_us[k]), self.frames[k]) for k in nearest)
 
     def frame_nearest(self, t_us: float) -> StackFrame:
         """Return the kept frame nearest to *t_us*."""
@@ -175,7 +179,15 @@ def make(case: Case) -> SweepRecording:
     sharpest = vertex(np.array(edges), int(np.argmax(edges)))
     sharpest_us = float(np.interp(sharpest, np.arange(len(kept_t_us)), kept_t_us))
     return SweepRecording(
-        case, seen.t_us, seen.x, seen.y, seen.on, np.array(kept_t_us), np.stack(kept), chosen.position_um(sharpest_us)
+        case=case,
+        t_us=seen.t_us,
+        x=seen.x,
+        y=seen.y,
+        on=seen.on,
+        frame_t_us=np.array(kept_t_us),
+        frames=np.stack(kept),
+        sharpest_um=chosen.position_um(sharpest_us),
+        truth_us=chosen.truth_us,
     )
 
 
@@ -187,8 +199,13 @@ def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
     if path.is_file():
         with np.load(path) as kept:
             columns = {name: kept[name] for name in ("x", "y", "on", "frame_t_us", "frames")}
-            sharpest_um = float(kept["sharpest_um"])
-            return SweepRecording(case, kept["t_us"].astype(np.int64), **columns, sharpest_um=sharpest_um)
+            return SweepRecording(
+                case=case,
+                t_us=kept["t_us"].astype(np.int64),
+                **columns,
+                sharpest_um=float(kept["sharpest_um"]),
+                truth_us=case.of_set.truth_us,
+            )
     made = make(case)
     cache.mkdir(parents=True, exist_ok=True)
     # Written aside and renamed: an interrupted run leaves no half a case under the name.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.cases import GENERATION, load_or_make
 from benchmarks.methods import NO_FRAMES, Row, all_methods, run_method
+from benchmarks.recorded import read_recorded
 from benchmarks.sets import MAP, SETS
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def run_case(work: Work) -> list[Row]:
     missing = [pair for pair in work.wanted if pair not in known]
     if missing:
         methods = all_methods()
-        recording = load_or_make(work.case, work.cache)
+        recorded = work.case.folder is not None
+        recording = read_recorded(work.case) if recorded else load_or_make(work.case, work.cache)
         for name, rate in missing:
             known[name, rate] = run_method(methods[name], rate, recording)
         kept = {"generation": GENERATION, "rows": [row.as_dict() for row in known.values()]}

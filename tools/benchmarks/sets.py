@@ -9,6 +9,8 @@ The other four are like the paper's rig: 2 mm/s, 200 um either side of focus, a 
 lens, 2.67 um of defocus to a um of travel), bright or dark, the scene still, moving as in a hand, or shaking. Only the
 region that matters is simulated, with a margin, in place of the whole sensor. ``davis`` has frames, noisy ones;
 ``evk4`` has none: its record begins with an aperture that opens in 20 ms, from which a picture must be made.
+
+The ``third`` sets are recorded (``--recorded``), not made here.
 """
 
 from __future__ import annotations
@@ -116,6 +118,8 @@ SETS = {
     for one in (
         CaseSet("syn", "the paper's synthetic set", C05, _PAPER_MOTIONS, (1, 2, 3, 4), ("50", "20", "1"), 1.0 / 3.0),
         CaseSet("syn-std", "the same, threshold 0.2", STD, _PAPER_MOTIONS, (1, 2, 3, 4), ("50", "20", "1")),
+        CaseSet("third-c05", "third-party sweeps, threshold 0.05", C05, (), (), ("50", "20", "1"), 1.0 / 3.0),
+        CaseSet("third-std", "third-party sweeps, threshold 0.2", STD, (), (), ("50", "20", "1")),
         _rig("davis-bright", "like a DAVIS346, bright", BRIGHT, ("50", "1"), size_px=160, frame_noise_dn=1.0),
         _rig("davis-dark", "like a DAVIS346, dark", DARK, ("20", "1"), size_px=160, frame_noise_dn=4.0),
         _rig("evk4-bright", "like an EVK4, events only, bright", BRIGHT, (MAP,), size_px=240, expose=EXPOSE),
