@@ -161,7 +161,7 @@ def test_white_and_lasting_jitter_have_the_speed_asked_for() -> None:
 def test_the_set_has_the_papers_84_cases_and_patterns_choose_among_them() -> None:
     assert len(cases_of("syn", 1)) == 84
     assert len(cases_of("syn-std", 1)) == 84
-    assert len({case.name for name in SETS for case in cases_of(name, 1)}) == 2 * 84 + 4 * 21
+    assert len({case.name for name in SETS for case in cases_of(name, 1)}) == 2 * 84 + 5 * 21 + 36
     assert [case.name for case in cases_of("syn", 1, "*-camera-fov2-static")] == ["syn-camera-fov2-static"]
 
 
@@ -240,6 +240,8 @@ def test_misses_and_wild_answers_are_counted_beside_the_mean_not_in_it() -> None
     assert score.published_um == 4.93
     (nothing,) = scores([row(None)])
     assert nothing.mae_um is None
+    (fooled,) = scores([replace(row(0.5), set_name="nothing"), replace(row(None), set_name="nothing")])
+    assert (fooled.missed, fooled.outside) == (1, 1)
 
 
 def test_a_plot_is_text_and_lines_and_escapes_what_it_is_told() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.optics import FocusRenderer, load_psf
 from benchmarks.retina import Retina, RetinaEvents, joined
-from benchmarks.scenes import SCENES, load_picture
+from benchmarks.scenes import load_picture
 from benchmarks.sets import APERTURE_US, FRAME_PERIODS_US, SETS, CaseSet
 from benchmarks.shake import MOTIONS, shifts_px
 from elpd.baselines import FocusStack, LensPath, StackFrame
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+LAMP_HZ = 100.0
+"""A lamp on 50 Hz mains."""
 
 GENERATION = 3
 """Raised whenever the same name and seed would give other events, so that stale files are not used."""
@@ -133,7 +136,7 @@ def cases_of(set_name: str, seed: int, pattern: str = "*") -> list[Case]:
     chosen = SETS[set_name]
     every = (
         Case(set_name, scene, field, motion, seed)
-        for scene in SCENES
+        for scene in chosen.scenes
         for field in chosen.fields
         for motion in chosen.motions
     )
@@ -155,7 +158,8 @@ def make(case: Case) -> SweepRecording:
     kept_t_us, kept, edges = [], [], []
     for t_us, shift in zip(times_us, moved, strict=True):
         position_um = chosen.defocus_per_um * chosen.position_um(t_us)
-        image = np.clip(renderer.frame(position_um, (float(shift[0]), float(shift[1]))), 0.0, 255.0)
+        lamp = np.float32(1.0 + chosen.flicker * np.sin(2.0 * np.pi * LAMP_HZ * t_us / 1e6))
+        image = np.clip(lamp * renderer.frame(position_um, (float(shift[0]), float(shift[1]))), 0.0, 255.0)
         if chosen.expose is not None and t_us <= APERTURE_US:
             dimmed = image * np.float32(t_us / APERTURE_US)
             if aperture is None:

@@ -37,6 +37,29 @@ PLOTTED = (
 )
 """What error distributions show; no set has more than eight of them, which can still be told apart."""
 
+COLUMNS = {
+    "cases": "cases",
+    "MAE um": "mae_um",
+    "bias": "bias_um",
+    "worst": "worst_um",
+    "to sharpest": "to_sharpest_um",
+    "missed": "missed",
+    "outside": "outside",
+    "early": "early",
+    "wrong way": "wrong_way",
+    "decided um": "decided_um",
+    "to focus ms": "focusing_ms",
+    "CPU ms": "cpu_ms",
+    "rms err/σ": "spread",
+    "paper MAE": "published_um",
+    "rerun MAE": "rerun_um",
+}
+COUNTS_OF_TROUBLE = ("missed", "outside", "early", "wrong_way")
+SIGNED = ("bias_um", "decided_um")
+BAD = " class='bad'"
+
+WORST_DRAWN_UM = 400.0
+
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; color: #111 }
 table { border-collapse: collapse; margin: .6rem 0 1.6rem; font-size: 13px; font-variant-numeric: tabular-nums }
@@ -52,13 +75,14 @@ svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; fon
 WORDS = """
 <p>One sweep per case; truth is the plane of least RMS spot radius. <b>Error</b> is estimate less truth. A mean over
 answered cases says nothing about the others: <b>missed</b> counts cases without an answer, <b>outside</b> answers
-more than one depth of focus off, <b>early</b> decisions more than that before focus. <b>Decided</b> is how far past
-focus the lens was when the answer could first be given as it stands, the median: a method that looks at the whole
-stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the start of the
-sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE against the place
-where the noise-free picture has its highest contrast: off the axis it is not where the spot is smallest, and a
-method that looks at pictures can hardly do better than their distance. <b>CPU</b> is the median processor time of
-the method for the whole sweep, in this implementation.</p>
+more than one depth of focus off, <b>early</b> decisions more than that before focus, <b>wrong way</b> those that
+took the approach for receding. Where there is nothing to focus on, every answer is outside. <b>Decided</b> is how
+far past focus the lens was when the answer could first be given as it stands, the median: a method that looks at
+the whole stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the
+start of the sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE
+against the place where the noise-free picture has its highest contrast: off the axis it is not where the spot is
+smallest, and a method that looks at pictures can hardly do better than their distance. <b>CPU</b> is the median
+processor time of the method for the whole sweep, in this implementation.</p>
 <p><b>Paper</b> is the paper's MAE on its own 84 cases, for ELP an estimate made in hindsight with a built-in
 offset; <b>rerun</b> what a later paper's authors found when they ran it. The cases here follow the paper's text;
 its pictures, lens and noise are not public, so the columns stand beside each other and are not the same
@@ -78,6 +102,7 @@ def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settin
         own_rows = [row for row in rows if row.set_name == set_name]
         own_scores = [score for score in table if score.set_name == set_name]
         motions = list(dict.fromkeys(score.motion for score in own_scores))
+        body.append(_overview(own_scores, motions))
         for motion in motions:
             body.append(f"<h3>{escape(motion)}</h3>")
             body.append(_score_table([score for score in own_scores if score.motion == motion]))
@@ -105,44 +130,49 @@ def _setting(chosen: CaseSet) -> str:
     )
 
 
+def _overview(table: Sequence[Score], motions: Sequence[str]) -> str:
+    """Return the paper's kind of table: a line per method and frame rate, MAE per motion, its number in brackets."""
+    methods = all_methods()
+    heads = "".join(f"<th>{escape(motion)}</th>" for motion in motions)
+    told = "MAE um; in brackets the paper's where it has one; +n cases without an answer, !n wrong answers"
+    lines = [f"<h3>{told}</h3><div class='scroll'><table>"]
+    lines.append(f"<tr><th class='word'>method</th><th class='word'>fps</th>{heads}</tr>")
+    by_pair: dict[tuple[str, str], dict[str, Score]] = {}
+    for score in table:
+        by_pair.setdefault((score.method, score.rate), {})[score.motion] = score
+    for (name, rate), found in by_pair.items():
+        lines.append(f"<tr{' class=ours' if name == OURS else ''}><td class='word'>{escape(methods[name].title)}</td>")
+        lines.append(f"<td class='word'>{rate}</td>")
+        lines.extend(f"<td>{_overview_cell(found[one]) if one in found else ''}</td>" for one in motions)
+        lines.append("</tr>")
+    return "".join(lines) + "</table></div>"
+
+
+def _overview_cell(score: Score) -> str:
+    published = "" if score.published_um is None else f" ({score.published_um:.2f})"
+    missed = f" +{score.missed}" if score.missed else ""
+    outside = f" <b>!{score.outside}</b>" if score.outside else ""
+    return f"{_number(score.mae_um)}{published}{missed}{outside}"
+
+
 def _score_table(table: Sequence[Score]) -> str:
     methods = all_methods()
-    heads = (
-        ("method", "fps", "sees"),
-        (
-            "cases",
-            "MAE um",
-            "bias",
-            "worst",
-            "to sharpest",
-            "missed",
-            "outside",
-            "early",
-            "decided um",
-            "to focus ms",
-            "CPU ms",
-        ),
-        ("rms err/σ", "paper MAE", "rerun MAE"),
-    )
-    words = "".join(f"<th class='word'>{head}</th>" for head in heads[0])
-    numbers = "".join(f"<th>{head}</th>" for head in (*heads[1], *heads[2]))
+    words = "".join(f"<th class='word'>{head}</th>" for head in ("method", "fps", "sees"))
+    numbers = "".join(f"<th>{head}</th>" for head in COLUMNS)
     lines = [f"<div class='scroll'><table><tr>{words}{numbers}</tr>"]
     for score in table:
         method = methods[score.method]
-        bad = [" class='bad'" if count else "" for count in (score.missed, score.outside, score.early)]
-        lines.append(f"<tr{' class=ours' if score.method == OURS else ''}>")
-        lines.append(f"<td class='word'>{escape(method.title)}</td><td class='word'>{score.rate}</td>")
-        lines.append(f"<td class='word'>{escape(method.sees)}</td><td>{score.cases}</td>")
-        lines.append(f"<td><b>{_number(score.mae_um)}</b></td><td>{_number(score.bias_um, signed=True)}</td>")
-        lines.append(
-            f"<td>{_number(score.worst_um)}</td><td>{_number(score.to_sharpest_um)}</td><td{bad[0]}>{score.missed}</td><td{bad[1]}>{score.outside}</td>"
-        )
-        lines.append(f"<td{bad[2]}>{score.early}</td><td>{_number(score.decided_um, signed=True)}</td>")
-        lines.append(
-            f"<td>{_number(score.focusing_ms)}</td><td>{_number(score.cpu_ms)}</td><td>{_number(score.spread)}</td>"
-        )
-        lines.append(f"<td>{_number(score.published_um)}</td><td>{_number(score.rerun_um)}</td></tr>")
+        told = "".join(f"<td class='word'>{escape(word)}</td>" for word in (method.title, score.rate, method.sees))
+        cells = ""
+        for name in COLUMNS.values():
+            value = getattr(score, name)
+            cells += f"<td{BAD if value and name in COUNTS_OF_TROUBLE else ''}>{_cell(value, name)}</td>"
+        lines.append(f"<tr{' class=ours' if score.method == OURS else ''}>{told}{cells}</tr>")
     return "".join(lines) + "</table></div>"
+
+
+def _cell(value: float | None, name: str) -> str:
+    return str(value) if isinstance(value, int) else _number(value, signed=name in SIGNED)
 
 
 def _case_table(rows: Sequence[Row]) -> str:
@@ -164,7 +194,7 @@ def _case_table(rows: Sequence[Row]) -> str:
             if row.error_um is None:
                 lines.append(f"<td title='{escape(row.reason, quote=True)}'>/</td>")
             else:
-                bad = " class='bad'" if abs(row.error_um) > SETS[row.set_name].depth_of_focus_um else ""
+                bad = BAD if abs(row.error_um) > SETS[row.set_name].depth_of_focus_um else ""
                 lines.append(f"<td{bad}>{row.error_um:+.2f}</td>")
         lines.append("</tr>")
     return "".join(lines) + "</table></div></details>"
@@ -177,13 +207,15 @@ def _errors(rows: Sequence[Row], motion: str) -> str:
         own = [row for row in rows if (row.method, row.rate) == (method, rate)]
         errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
         if errors:
-            shares = [(k + 1) / len(own) for k in range(len(errors))]
-            series.append(Series(_label(method, rate), errors, shares))
+            # A staircase, drawn on to the right edge at the share that had an answer at all.
+            corners = [corner for error in errors for corner in (error, error)] + [WORST_DRAWN_UM]
+            shares = [step / len(own) for k in range(len(errors)) for step in (k, k + 1)] + [len(errors) / len(own)]
+            series.append(Series(_label(method, rate), corners, shares))
     marks = [(SETS[row.set_name].depth_of_focus_um, "depth of focus") for row in rows[:1]]
     return draw(
         Plot(
             f"{motion}: share of cases below an error", "|error| um", "share of all cases", series,
-            log_x=True, x_range=(0.02, 400.0), y_range=(0.0, 1.0), marks=marks,
+            log_x=True, x_range=(0.02, WORST_DRAWN_UM), y_range=(0.0, 1.0), marks=marks,
         )
     )  # fmt: skip
 

@@ -17,10 +17,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SCENES = ("astronaut", "brick", "camera", "chelsea", "coffee", "grass", "gravel")
+BLANKS = ("wall", "card", "cap")
+_BLANK_DN = {"wall": 200.0, "card": 60.0, "cap": 0.0}
 
 
 def load_picture(name: str, side: int) -> NDArray[np.float32]:
-    """Return the middle square of scene *name* as (side, side) float32 of 0 to 255."""
+    """Return the middle square of scene *name* as (side, side) float32 of 0 to 255.
+
+    ``BLANKS`` are even fields of grey.
+    """
+    if name in _BLANK_DN:
+        return np.full((side, side), _BLANK_DN[name], dtype=np.float32)
     with as_file(files("elpd_drivers.sim") / "scenes" / f"{name}.jpg") as path:
         grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if grey is None:

@@ -25,8 +25,9 @@ class Score:
     """One method at one frame rate over the cases of one set and motion; lengths in um, ``None`` without answers.
 
     ``missed`` had no answer, ``outside`` one more than a depth of focus from the truth, ``early`` a decision more than
-    a depth of focus before it. ``to_sharpest_um`` is the MAE against the sharpest picture. ``spread`` is the RMS of
-    error over claimed sigma; honest sigmas make it one.
+    a depth of focus before it, ``wrong_way`` took the approach for receding. Where nothing is there to be focused on,
+    every answer is outside. ``to_sharpest_um`` is the MAE against the sharpest picture. ``spread`` is the RMS of error
+    over claimed sigma; honest sigmas make it one.
     """
 
     set_name: str
@@ -37,6 +38,7 @@ class Score:
     missed: int
     outside: int
     early: int
+    wrong_way: int
     mae_um: float | None
     bias_um: float | None
     worst_um: float | None
@@ -64,6 +66,7 @@ def scores(rows: Iterable[Row]) -> list[Score]:
 def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
     set_name, motion, method, rate = key
     limit_um = SETS[set_name].depth_of_focus_um
+    nothing_there = SETS[set_name].nothing_there
     errors = np.array([row.error_um for row in rows if row.error_um is not None], dtype=np.float64)
     decided = np.array([row.decided_um for row in rows if row.decided_um is not None], dtype=np.float64)
     focusing = np.array([row.focusing_ms for row in rows if row.focusing_ms is not None], dtype=np.float64)
@@ -77,8 +80,9 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
         rate=rate,
         cases=len(rows),
         missed=len(rows) - errors.size,
-        outside=int((np.abs(errors) > limit_um).sum()),
+        outside=errors.size if nothing_there else int((np.abs(errors) > limit_um).sum()),
         early=int((decided < -limit_um).sum()),
+        wrong_way=sum(row.details.get("direction") == "receding" for row in rows),
         mae_um=round(float(np.abs(errors).mean()), 3) if answered else None,
         bias_um=round(float(errors.mean()), 3) if answered else None,
         worst_um=round(float(np.abs(errors).max()), 3) if answered else None,

@@ -5,10 +5,14 @@
 (threshold 0.05, motion in pixels of the 600 x 600 picture). ``syn-std`` is the same with v2e's default threshold of 0.2
 and motion in the sensor's pixels, which is harder. Frames are instantaneous and noise-free, as in the paper.
 
-The other four are like the paper's rig: 2 mm/s, 200 um either side of focus, a depth of focus of 6 um (the same traced
-lens, 2.67 um of defocus to a um of travel), bright or dark, the scene still, moving as in a hand, or shaking. Only the
-region that matters is simulated, with a margin, in place of the whole sensor. ``davis`` has frames, noisy ones;
-``evk4`` has none: its record begins with an aperture that opens in 20 ms, from which a picture must be made.
+The ``davis`` and ``evk4`` sets are like the paper's rig: 2 mm/s, 200 um either side of focus, a depth of focus of 6 um
+(the same traced lens, 2.67 um of defocus to a um of travel), bright or dark, the scene still, moving as in a hand, or
+shaking. Only the region that matters is simulated, with a margin, in place of the whole sensor. ``davis`` has frames,
+noisy ones; ``evk4`` has none: its record begins with an aperture that opens in 20 ms, from which a picture must be
+made.
+
+``flicker`` and ``nothing`` are there to be refused: a lamp that flickers by 30 %, and a wall, a grey card and a lens
+cap, of which nothing but noise can be seen.
 
 The ``third`` sets are recorded (``--recorded``), not made here.
 """
@@ -18,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from benchmarks.retina import RetinaSettings
+from benchmarks.scenes import BLANKS, SCENES
 
 SECOND_US = 1_000_000
 
@@ -33,8 +38,8 @@ class CaseSet:
     """What is common to a set's cases.
 
     Lengths in um are of lens travel; ``defocus_per_um`` turns them into defocus behind the traced lens. ``motion_px``
-    is a pixel of motion in pixels of the sensor. ``rates`` are the frame rates that exist. ``expose`` is the sensor's
-    setting while the aperture opens, ``None`` without an aperture.
+    is a pixel of motion in pixels of the sensor, ``flicker`` the amplitude of a 100 Hz lamp. ``rates`` are the frame
+    rates that exist. ``expose`` is the sensor's setting while the aperture opens, ``None`` without an aperture.
     """
 
     name: str
@@ -55,6 +60,13 @@ class CaseSet:
     keep_every_us: int = 10_000
     frame_noise_dn: float = 0.0
     expose: RetinaSettings | None = None
+    scenes: tuple[str, ...] = SCENES
+    flicker: float = 0.0
+
+    @property
+    def nothing_there(self) -> bool:
+        """Whether there is nothing to focus on, so that every answer is wrong."""
+        return self.scenes == BLANKS
 
     @property
     def sweep_begin_us(self) -> int:
@@ -123,6 +135,17 @@ SETS = {
         _rig("davis-bright", "like a DAVIS346, bright", BRIGHT, ("50", "1"), size_px=160, frame_noise_dn=1.0),
         _rig("davis-dark", "like a DAVIS346, dark", DARK, ("20", "1"), size_px=160, frame_noise_dn=4.0),
         _rig("evk4-bright", "like an EVK4, events only, bright", BRIGHT, (MAP,), size_px=240, expose=EXPOSE),
+        _rig("flicker", "like a DAVIS346, bright, a lamp of 30 %", BRIGHT, ("50", "1"), size_px=160, flicker=0.3),
+        _rig(
+            "nothing",
+            "like a DAVIS346, dark, nothing to see",
+            DARK,
+            ("20", "1"),
+            size_px=160,
+            frame_noise_dn=4.0,
+            fields=(1, 2, 3, 4),
+            scenes=BLANKS,
+        ),
         _rig("evk4-dark", "like an EVK4, events only, dark", DARK, (MAP,), size_px=240, expose=EXPOSE),
     )
 }
