@@ -157,11 +157,13 @@ def make(case: Case) -> SweepRecording:
     retina: Retina | None = None
     kept_t_us, kept, edges = [], [], []
     for t_us, shift in zip(times_us, moved, strict=True):
-        position_um = chosen.defocus_per_um * chosen.position_um(t_us)
+        opened = min(t_us / APERTURE_US, 1.0) if chosen.expose is not None else 1.0
+        # The area opens evenly, so the diameter, and with it the blur of a given defocus, with the square root.
+        position_um = np.sqrt(opened) * chosen.defocus_per_um * chosen.position_um(t_us)
         lamp = np.float32(1.0 + chosen.flicker * np.sin(2.0 * np.pi * LAMP_HZ * t_us / 1e6))
         image = np.clip(lamp * renderer.frame(position_um, (float(shift[0]), float(shift[1]))), 0.0, 255.0)
         if chosen.expose is not None and t_us <= APERTURE_US:
-            dimmed = image * np.float32(t_us / APERTURE_US)
+            dimmed = image * np.float32(opened)
             if aperture is None:
                 aperture = Retina(chosen.expose, dimmed, 0, APERTURE_US, retina_rng)
             else:
