@@ -56,7 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.recorded is not None:
         cases |= {case.name: case for case in recorded_cases(chosen.recorded)}
     works = [
-        Work(case, wanted_pairs(case.set_name, chosen.methods, chosen.rates), rows_folder, cache)
+        Work(
+            case,
+            wanted_pairs(case.set_name, chosen.methods, chosen.rates),
+            rows_folder,
+            cache,
+            tuple(chosen.redo),
+        )
         for case in cases.values()
     ]
     if not any(work.wanted for work in works):
@@ -95,6 +101,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rates", type=_names(FRAME_PERIODS_US), default=rates, help="frame rates (default 50,20,1)")
     parser.add_argument("--cases", default="*", metavar="PATTERN", help="only cases of such a name, e.g. '*-camera-*'")
     parser.add_argument("--cache", metavar="DIR|none", help="where cases are kept (default: OUT/cases)")
+    parser.add_argument(
+        "--redo", type=_names(every), default=[], metavar="METHODS", help="with --resume: forget what is known of these"
+    )
     parser.add_argument("--resume", action="store_true", help="keep what OUT holds already and do the rest")
     return parser.parse_args(arguments)
 

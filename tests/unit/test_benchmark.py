@@ -271,6 +271,13 @@ def test_the_benchmark_runs_resumes_and_writes_one_self_contained_report(
     assert [(one["method"], one["rate"]) for one in second["rows"][:2]] == [("elpd", "50"), ("elpd", "-")]
     assert all(abs(one["error_um"]) < 16.0 for one in second["rows"][:2])
 
+    again = [*common, "--methods", "egs,pbf", "--resume", "--redo", "egs"]
+    assert benchmark.main(again) == 0
+    third = json.loads((out / "results.json").read_text())["rows"]
+    assert third[1] == first["rows"][1]
+    assert third[0]["error_um"] == first["rows"][0]["error_um"]
+    assert benchmark.main([*common, "--methods", "elpd,egs,pbf,elp-syn", "--resume"]) == 0
+
     with (out / "rows.csv").open() as file:
         assert [line["method"] for line in csv.DictReader(file)] == ["elpd", "elpd", "egs", "pbf", "elp-syn"]
     page = (out / "report.html").read_text()

@@ -28,12 +28,16 @@ EXECUTORS = ("joblib", "serial")
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One case, the (method, rate) pairs wanted of it, where its rows go and where cases are kept."""
+    """One case, the (method, rate) pairs wanted of it, where its rows go and where cases are kept.
+
+    What an earlier run left of the methods in ``redo`` is forgotten.
+    """
 
     case: Case
     wanted: tuple[tuple[str, str], ...]
     rows_folder: Path
     cache: Path | None
+    redo: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -53,7 +57,9 @@ def known_rows(work: Work) -> list[Row]:
     if not work.path.is_file():
         return []
     kept = json.loads(work.path.read_text(encoding="utf-8"))
-    return [Row(**row) for row in kept["rows"]] if kept["generation"] == GENERATION else []
+    if kept["generation"] != GENERATION:
+        return []
+    return [Row(**row) for row in kept["rows"] if row["method"] not in work.redo]
 
 
 def run_case(work: Work) -> list[Row]:
