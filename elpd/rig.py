@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from elpd.config import Config, DeviceSection, LensSection
     from elpd.ports import Aperture, Clock, EventCamera, Lens
 
-GROUPS = ("elpd.rigs", "elpd.cameras", "elpd.lenses", "elpd.apertures", "elpd.formats", "elpd.boards")
+KINDS = {
+    "elpd.rigs": "rig",
+    "elpd.cameras": "camera",
+    "elpd.lenses": "lens",
+    "elpd.apertures": "aperture",
+    "elpd.formats": "format",
+    "elpd.boards": "board",
+}
 
 
 def find(group: str, name: str) -> Any:
@@ -35,7 +42,7 @@ def find(group: str, name: str) -> Any:
     """
     found = {point.name: point for point in entry_points(group=group)}
     if name not in found:
-        kind = group.removeprefix("elpd.").rstrip("s")
+        kind = KINDS.get(group, group)
         known = ", ".join(sorted(found)) or "none"
         raise ConfigError(f"no {kind} driver is called {name!r}; installed: {known}")
     return _load(found[name])
@@ -59,8 +66,8 @@ def build(config: Config) -> RigParts:
 
 
 def release(parts: RigParts) -> None:
-    """Give every device back, the lens last: it must be able to stop until the end."""
-    for device in (parts.camera, parts.aperture, parts.lens):
+    """Give the devices back, the lens last: it must be able to stop until the end. An aperture stays as it is."""
+    for device in (parts.camera, parts.lens):
         if isinstance(device, Closeable):
             device.close()
 

@@ -22,7 +22,7 @@ import time
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from elpd_drivers.formats.raw import write_raw
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+
+Run: TypeAlias = "Callable[[], object]"
 
 PIECE_WORDS = 1 << 16
 WINDOW_US = 1000
@@ -82,14 +84,15 @@ def measure(path: Path, rounds: int, megabytes: float) -> dict[str, Any]:
         write_raw(tiled, geometry, [words], {})
         contenders, missing = _contenders(words, tiled, geometry, weights)
         speeds: dict[str, list[float]] = {name: [] for name in contenders}
-        for run, _ in contenders.values():
-            run()
+        for prepare, _ in contenders.values():
+            prepare()()
         for _ in range(rounds):
-            for name, (run, n_bytes) in contenders.items():
+            for name, (prepare, data) in contenders.items():
+                run = prepare()
                 begun = time.thread_time()
                 run()
-                speeds[name].append(n_bytes / (time.thread_time() - begun) / 1e6)
-    per_byte = events / words.nbytes
+                speeds[name].append(data.nbytes / (time.thread_time() - begun) / 1e6)
+    per_byte = {name: _count(data, geometry) / data.nbytes for name, (_, data) in contenders.items()}
     ratios, reasons = _ratios(speeds, missing)
     return {
         "file": path.name,
@@ -97,7 +100,7 @@ def measure(path: Path, rounds: int, megabytes: float) -> dict[str, Any]:
         "events": events,
         "rounds": rounds,
         "rows": [
-            {"name": name, "mb_s": round(median(values), 1), "mev_s": round(median(values) * per_byte, 2)}
+            {"name": name, "mb_s": round(median(values), 1), "mev_s": round(median(values) * per_byte[name], 2)}
             for name, values in speeds.items()
         ],
         "ratios": ratios,
@@ -107,8 +110,11 @@ def measure(path: Path, rounds: int, megabytes: float) -> dict[str, Any]:
 
 def _contenders(
     words: NDArray[np.uint16], tiled: Path, geometry: Geometry, weights: NDArray[np.int64]
-) -> tuple[dict[str, tuple[Callable[[], None], int]], dict[str, str]]:
-    """Return what can run here, each with the bytes it reads, and why the rest cannot."""
+) -> tuple[dict[str, tuple[Callable[[], Run], NDArray[np.uint16]]], dict[str, str]]:
+    """Return what can run here and the words it reads, and why the rest cannot.
+
+    Each is a function that makes what it needs (a decoder, a weight table) and returns what is then timed.
+    """
     pieces = np.split(words, range(PIECE_WORDS, words.size, PIECE_WORDS))
     as_bytes = [piece.tobytes() for piece in pieces]
     packets = [CameraPacket(piece, Encoding.EVT3, HostNs(0)) for piece in pieces]
@@ -117,22 +123,22 @@ def _contenders(
     y, x = (max((side - 400) // 2, 0) for side in weights.shape)
     square[y : y + 400, x : x + 400] = True
 
-    def decode() -> None:
-        decoder = Evt3Decoder(geometry)
-        for piece in pieces:
-            decoder.feed(piece)
+    def feed(feeder: Any, data: list[Any]) -> Run:
+        def run() -> None:
+            for piece in data:
+                feeder.feed(piece)
 
-    def fused(*, inside: NDArray[np.bool_] | None = None, rate_cap: bool = False) -> None:
-        windows = ElpWindows(weights, inside, window_us=WINDOW_US, rate_cap=rate_cap)
-        for packet in packets:
-            windows.feed(packet)
+        return run
 
-    contenders: dict[str, tuple[Callable[[], None], int]] = {
-        "memcpy": (lambda: np.copyto(copy, words), words.nbytes),
-        "elpd decode": (decode, words.nbytes),
-        "elpd fused scalar": (fused, words.nbytes),
-        "elpd fused scalar, 400x400": (lambda: fused(inside=square), words.nbytes),
-        "elpd fused scalar, rate cap": (lambda: fused(rate_cap=True), words.nbytes),
+    def fused(*, inside: NDArray[np.bool_] | None = None, rate_cap: bool = False) -> Run:
+        return feed(ElpWindows(weights, inside, window_us=WINDOW_US, rate_cap=rate_cap), packets)
+
+    contenders: dict[str, tuple[Callable[[], Run], NDArray[np.uint16]]] = {
+        "memcpy": (lambda: lambda: np.copyto(copy, words), words),
+        "elpd decode": (lambda: feed(Evt3Decoder(geometry), pieces), words),
+        "elpd fused scalar": (fused, words),
+        "elpd fused scalar, 400x400": (lambda: fused(inside=square), words),
+        "elpd fused scalar, rate cap": (lambda: fused(rate_cap=True), words),
     }
     missing = {}
     try:
@@ -140,17 +146,12 @@ def _contenders(
     except ImportError:
         missing["evt3"] = "the evt3 package is not installed"
     else:
-
-        def peer() -> None:
-            decoder = evt3.Decoder(geometry.width, geometry.height)
-            for piece in as_bytes:
-                decoder.feed(piece)
-
-        contenders["evt3 decode"] = (peer, words.nbytes)
         beginning = _beginning(words, geometry)
+        size = (geometry.width, geometry.height)
+        contenders["evt3 decode"] = (lambda: feed(evt3.Decoder(*size), as_bytes), words)
         contenders["evt3 + numpy event frame"] = (
-            lambda: _event_frames(evt3.Decoder(geometry.width, geometry.height), beginning.tobytes(), weights),
-            beginning.nbytes,
+            lambda: lambda: _event_frames(evt3.Decoder(*size), beginning.tobytes(), weights),
+            beginning,
         )
     try:
         faery = importlib.import_module("faery.extension")
@@ -163,7 +164,7 @@ def _contenders(
                 for _ in decoder:
                     pass
 
-        contenders["faery decode"] = (file_peer, words.nbytes)
+        contenders["faery decode"] = (lambda: file_peer, words)
     return contenders, missing
 
 

@@ -8,6 +8,7 @@ that is not the answer goes to stderr.
 from __future__ import annotations
 
 import importlib
+import io
 import sys
 from typing import cast
 
@@ -62,6 +63,9 @@ def root() -> None:
 def main() -> None:
     """Run the command line; every error ends here, without a traceback, with its own exit code."""
     as_json = "--json" in sys.argv
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a curve's dots must not break a terminal of few letters
     try:
         code = root.main(standalone_mode=False)
     except click.exceptions.Abort:

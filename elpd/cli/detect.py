@@ -16,16 +16,15 @@ from elpd.record.journal import is_run
 from elpd.record.layouts import read_sweep
 from elpd.record.paper_sweep import detect_as_published
 from elpd.record.run_sweep import read_run_sweep
-from elpd.record.sweep_file import SweepSearch
-from elpd.records import Geometry, Outcome
+from elpd.record.sweep_file import Detection, SweepSearch
+from elpd.records import Direction, Geometry, Outcome
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
 from elpd.vision.ruler import Ruler
-from elpd.vision.temporal_map import read_transmittance, temporal_image
+from elpd.vision.temporal_map import quality, read_transmittance, temporal_image
 
 if TYPE_CHECKING:
-    from elpd.record.sweep_file import Detection
     from elpd.records import TemporalImage
 
 
@@ -88,6 +87,9 @@ def command(
         first = FirstEventMap(sweep.geometry, *aperture_us)
         first.add(sweep.t_us, sweep.x, sweep.y, sweep.on)
         picture = temporal_image(first.believed(), read_transmittance(transmittance), SensorUs(aperture_us[0]))
+        usable, why = quality(picture)
+        if not usable:
+            return _finish(Detection(Outcome.NO_TEXTURE, why, Direction.UNKNOWN), as_json=as_json)
         reference = reference_from_temporal_image(picture, roi)
         begin_us = aperture_us[1]
     if recorded is not None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 from typing import Any
 
 import click
 
-from elpd.cli.common import config_options, json_option, parse_roi, print_json
+from elpd.cli.common import config_options, interruptible, json_option, parse_roi, print_json
 from elpd.config import Config, load
 from elpd.errors import BusyError, UsageError
 from elpd.focus.settings import FocusRequest
@@ -48,14 +46,15 @@ def command(
         dry_run=dry_run,
     )
     from elpd.cli.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
-    from elpd.cli.view import plain_view  # noqa: PLC0415
+    from elpd.cli.view import open_view  # noqa: PLC0415
 
-    cancelled = threading.Event()
-    previous = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
-    try:
-        session = focus_once(config, request, None if as_json else plain_view(), cancelled.is_set)
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    with interruptible() as cancelled:
+        if as_json:
+            session = focus_once(config, request, None, cancelled)
+        else:
+            with open_view() as view:
+                session = focus_once(config, request, view, cancelled)
+                view.result(session.result)
     if as_json:
         print_json(session.fields())
     else:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from elpd.cli.common import config_options, json_option, print_json
-from elpd.errors import ConfigError, UsageError
+from elpd.config import Config, load
+from elpd.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,8 +33,8 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
     """Serve a simulated BOARD (grbl, tic, ...) on a pty until interrupted.
 
-    Settings stand in the table [board] of the configuration, and on the command line as --set KEY=VALUE: what the lens
-    is like (travel_um, backlash_um, start_um, ...), how the board is set up (referenced, baud, ...), and seed.
+    Its settings are given as --set board.KEY=VALUE: what the lens is like (travel_um, backlash_um, start_um, ...) and
+    how the board is set up (referenced, baud, ...). From the configuration it takes sim.seed and lens.um_per_step.
     """
     settings = board_settings(config_path, overrides)
     served = find_board(board)
@@ -66,20 +67,24 @@ def find_board(name: str) -> Board:
 
 
 def board_settings(config_path: Path | None, overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Read the table ``[board]`` and the overrides upon it. Raises ``ConfigError``."""
-    settings: dict[str, Any] = {}
-    if config_path is not None:
-        try:
-            table = tomllib.loads(config_path.read_text())
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise ConfigError(f"{config_path}: {error}") from None
-        settings.update(table.get("board", {}))
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals:
-            raise ConfigError(f"--set is KEY=VALUE, such as board.start_um=800; got {override!r}")
-        settings[key.strip().removeprefix("board.").removeprefix("sim.")] = _value(text.strip())
+    """Return the board's settings: the config's seed and ruler, then the overrides that are not the config's.
+
+    Raises ``ConfigError`` for what is neither; the board itself refuses keys that it does not know.
+    """
+    own = tuple(item for item in overrides if _is_boards(item))
+    config = load(config_path, [item for item in overrides if item not in own])
+    settings: dict[str, Any] = {"seed": config.sim.seed, "um_per_step": config.lens.um_per_step}
+    for override in own:
+        key, _, text = override.partition("=")
+        settings[key.strip().removeprefix("board.")] = _value(text.strip())
     return settings
+
+
+def _is_boards(override: str) -> bool:
+    """Say whether an override is for the board: ``board.KEY=VALUE``, or a key of one word that is no config table."""
+    key, equals, _ = override.partition("=")
+    name = key.strip()
+    return bool(equals) and (name.startswith("board.") or ("." not in name and name not in Config.model_fields))
 
 
 def _value(text: str) -> Any:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from elpd.events.epoch import enter_epoch
 from elpd.events.registers import (
     HIGH,
     check_geometry,
@@ -25,7 +26,7 @@ from elpd.events.registers import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry, Trigger
+    from elpd.records import CameraPacket, Geometry, Trigger
     from elpd.units import SensorUs
 
 
@@ -115,6 +116,10 @@ class WordDecoder:
     def forget_addresses(self) -> None:
         """Say that words are missing here: rows and vector bases from before them hold no more."""
         forget_addresses(self._state)
+
+    def enter_epoch(self, packet: CameraPacket) -> None:
+        """Let a packet of a running camera say which turn of its clock the first words belong to."""
+        enter_epoch(packet, self._state)
 
     @property
     def time_us(self) -> SensorUs | None:

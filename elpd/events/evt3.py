@@ -188,10 +188,29 @@ def decode(  # noqa: C901  (one function: calls cost)
         word = np.int64(words[i])
         i += np.uint64(1)
         kind = word >> 12
+        if kind == 0x8:
+            content = word & 0xFFF
+            if content == high:
+                continue
+            if high >= 2048 + content:
+                loop += 1
+            high = content
+            word = np.int64(0)
+            kind = np.int64(0x6)
+        # What mostly follows is taken at once: after a time a row, after a row a column.
+        if kind == 0x6:
+            low = word & 0xFFF
+            t = (loop << 24) + (high << 12) + low
+            if i == size:
+                break
+            word = np.int64(words[i])
+            if word >> 12 != 0x0:
+                continue
+            i += np.uint64(1)
+            kind = np.int64(0x0)
         if kind == 0x0:
             row = word
             x_limit = width if row < height else 0
-            # Nearly every row word is followed by a column: no need to ask what it is twice.
             if i == size:
                 break
             word = np.int64(words[i])
@@ -211,16 +230,6 @@ def decode(  # noqa: C901  (one function: calls cost)
                 y_out += 1
             else:
                 x_out += 1
-        elif kind == 0x6:
-            low = word & 0xFFF
-            t = (loop << 24) + (high << 12) + low
-        elif kind == 0x8:
-            if word & 0xFFF != high:
-                if high >= 2048 + (word & 0xFFF):
-                    loop += 1
-                high = word & 0xFFF
-                low = 0
-                t = (loop << 24) + (high << 12)
         elif kind == 0x3:
             vector_x = word & 0x7FF
             vector_on = (word >> 11) & 1

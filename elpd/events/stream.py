@@ -101,6 +101,7 @@ class PacketDecoder:
             self._decoder = DECODERS[packet.encoding](self._geometry)
         if packet.gap_before:
             self._decoder.forget_addresses()
+        self._decoder.enter_epoch(packet)
         return self._decoder.feed(packet.data)
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import CameraError, DeviceError, UsageError
 from elpd.focus import safety
-from elpd.focus.expose import expose
+from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
 from elpd.focus.stage import Stage
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
@@ -48,6 +48,9 @@ BIAS_SETTLE_MS = 10.0
 
 FRAME_LIMIT_MS = 500.0
 """A camera with frames delivers one within this, or has none."""
+
+REJOG_S = 0.25
+"""What a controller without a velocity mode takes from one jog to the opposite one, beside braking."""
 
 REST_LIMIT_MS = 1500.0
 """No lens this is for rings or brakes longer; past it the lens does not obey."""
@@ -94,7 +97,7 @@ class FocusCycle:
     observer
         Somebody who watches; never waited for.
     cancelled
-        Asked once per turn of the loop; true ends the cycle as CANCELLED.
+        Asked once per turn of any loop, in every phase; true ends the cycle as CANCELLED.
 
     """
 
@@ -142,11 +145,13 @@ class FocusCycle:
         try:
             self._parts.camera.start()
             try:
+                self._stage.interrupt = self._interrupt
                 outcome, reason = self._focus()
             except _Ended as ended:
                 outcome, reason = ended.outcome, ended.reason
                 self._go_to_declared_place()
-            final_um = self._stage.to_um(self._stage.rest(REST_LIMIT_MS).steps)
+            self._stage.interrupt = None
+            final_um = self._rest_um()
         except DeviceError:
             self._stop_hard()
             raise
@@ -165,7 +170,7 @@ class FocusCycle:
         picture = self._picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._choose(picture)
-        watch = self._arm(reference, roi)
+        watch = self._arm(reference, roi, frames=picture.map is None)
         if self._request.dry_run:
             raise _Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         passed = self._search(watch)
@@ -180,10 +185,12 @@ class FocusCycle:
     def _picture(self) -> Picture:
         """Get a picture of the scene: a stored one, an opening aperture's, or the newest frame."""
         request, geometry = self._request, self._parts.camera.geometry
-        if request.stored_map is not None:
-            return Picture.of_map(request.stored_map)
         if request.reference is not None:
-            return Picture.of_file(request.reference, geometry)
+            picture = Picture.of_file(request.reference, geometry)
+            if self._parts.aperture is not None:
+                self._parts.aperture.open()
+                self._stage.wait_ms(AFTER_FACTOR * self._parts.aperture.opening_ms)
+            return picture
         if self._parts.aperture is None:
             frame = self._stage.newest_frame(FRAME_LIMIT_MS)
             if frame is None:
@@ -225,7 +232,7 @@ class FocusCycle:
             )
         return roi, reference
 
-    def _arm(self, reference: Reference, roi: Roi) -> Watch:
+    def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
         camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
@@ -237,7 +244,7 @@ class FocusCycle:
             reference,
             roi,
             geometry,
-            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=self.map is None),
+            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=frames),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
         )
@@ -256,9 +263,11 @@ class FocusCycle:
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
         turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
+        if not capabilities.native_velocity:
+            turn_s += REJOG_S
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
-        self._stage.listener = None
+        self._stage.listener = self._stage.interrupt = None  # the sweep asks for itself, and stops the lens first
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
@@ -288,7 +297,7 @@ class FocusCycle:
                 reason=report.verdict.reason,
             )
             if report.end is SweepEnd.PASSED:
-                self._stage.listener = watch.keep
+                self._stage.listener, self._stage.interrupt = watch.keep, self._interrupt
                 return report
             if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
                 raise self._rule(report.verdict)
@@ -356,11 +365,13 @@ class FocusCycle:
         before = watch.events_in_cycle
         stage.listener = watch.count
         beyond_um = estimate.focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM)
+        rest = None
         for target_um in (beyond_um, estimate.focus_um):
             bounded = min(max(stage.to_steps(target_um), limits.min_steps), limits.max_steps)
-            stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
+            rest = stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
         self._phase(Phase.VERIFY)
-        rest = stage.rest(REST_LIMIT_MS)
+        if rest is None:
+            raise AssertionError("two moves end in a rest")
         error_um = stage.to_um(rest.steps) - estimate.focus_um
         if abs(error_um) > max(0.25 * settings.depth_of_focus_um, 2 * stage.um_per_step):
             raise _Ended(
@@ -407,8 +418,23 @@ class FocusCycle:
             ramp_um = speed_um_s**2 / (2 * self._stage.to_um(limits.acceleration_sps2))
         return speed_um_s * onset_ms / 1000.0 + ramp_um
 
+    def _rest_um(self) -> float:
+        """Return where the lens rests: by its newest report if that says so, else after waiting for one."""
+        report = self._stage.report
+        resting = report is not None and not report.moving and self._phases[-1][0] is Phase.VERIFY
+        return self._stage.to_um(
+            report.steps if resting and report is not None else self._stage.rest(REST_LIMIT_MS).steps
+        )
+
     def _here_um(self) -> float:
         return self._stage.to_um(self._parts.lens.position_at(self._stage.now_ns()).steps)
+
+    def _interrupt(self) -> None:
+        """End a phase that waits, if somebody asked for it or time is up."""
+        ms_to_deadline = (self._deadline_ns - self._stage.now_ns()) / NS_PER_MS
+        verdict = safety.decide(safety.Conditions(cancelled=self._cancelled(), ms_to_deadline=ms_to_deadline))
+        if verdict.action is not safety.Action.CONTINUE:
+            raise self._rule(verdict)
 
     def _rule(self, verdict: safety.Verdict) -> Exception:
         if verdict.action is safety.Action.FAULT:
@@ -419,7 +445,7 @@ class FocusCycle:
 
     def _go_to_declared_place(self) -> None:
         """After anything but FOCUSED: hold, start or preset. A *settled* start, read before anything moved."""
-        self._stage.listener = None
+        self._stage.listener = self._stage.interrupt = None
         self._parts.lens.stop(StopMode.RAMPED)
         self._stage.rest(REST_LIMIT_MS)
         place = {"hold": None, "start": self._start_um, "preset": self._settings.preset_um}[self._settings.on_failure]

@@ -7,14 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
+from elpd.focus import stored_map
+from elpd.records import TemporalImage
+from elpd.units import SensorUs
+from elpd.vision.pictures import read_picture
+from elpd.vision.reference import check_size, reference_from_frame, reference_from_temporal_image
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry, Roi, TemporalImage
+    from elpd.records import Geometry, Roi
     from elpd.vision.reference import Reference
 
 
@@ -41,10 +45,18 @@ class Picture:
 
     @classmethod
     def of_file(cls, path: Path, geometry: Geometry) -> Picture:
-        """Read an image of the whole sensor. Raises ``FormatError`` or ``UsageError`` (wrong size)."""
-        pixels = load_image(path)
-        check_size(pixels.shape, geometry, str(path))
-        return cls.of_frame(pixels)
+        """Read an image of the whole sensor or a stored map. Raises ``FormatError`` or ``UsageError`` (wrong size)."""
+        if path.suffix == ".npz":
+            stored = stored_map.load(path).image
+            check_size(stored.log_intensity.shape, geometry, str(path))
+            return cls.of_map(stored)
+        image = read_picture(path)
+        check_size(image.pixels.shape, geometry, str(path))
+        if not image.is_log:
+            return cls.of_frame(image.pixels)
+        log_image = np.ascontiguousarray(image.pixels, np.float32)
+        valid = np.ones(log_image.shape, np.bool_)
+        return cls.of_map(TemporalImage(log_image, valid, SensorUs(0), 1.0, 0, 0, float("nan")))
 
     def reference(self, roi: Roi) -> Reference:
         """Make the weights over a region."""

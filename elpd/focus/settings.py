@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from elpd.config import Config
-    from elpd.records import Roi, TemporalImage
+    from elpd.records import Roi
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,10 @@ class CycleSettings:
 class FocusRequest:
     """One request.
 
-    The picture to focus on is ``stored_map``, or the image file ``reference``, or, with neither, what the aperture's
-    opening or the newest frame shows.
+    The picture to focus on is the file ``reference`` (an image of the whole sensor, or a stored map), or, without one,
+    what the aperture's opening or the newest frame shows.
     """
 
     roi: Roi | None = None
     reference: Path | None = None
-    stored_map: TemporalImage | None = None
     dry_run: bool = False

@@ -42,6 +42,8 @@ class Stage:
         self.last_packet_ns = parts.clock.now_ns()
         self.listener: Callable[[CameraPacket], object] | None = None
         """Hears every packet that is read while a phase waits."""
+        self.interrupt: Callable[[], None] | None = None
+        """Asked before every read; raises to end the phase."""
 
     # --- time and place ---
 
@@ -66,8 +68,10 @@ class Stage:
     def read(self, timeout_s: float = READ_TIMEOUT_S) -> CameraPacket | None:
         """Read one packet, poll the lens once, keep the counters.
 
-        Raises ``CameraError`` after 200 ms of silence, ``LensError`` from the lens.
+        Raises ``CameraError`` after 200 ms of silence, ``LensError`` from the lens, and whatever ``interrupt`` does.
         """
+        if self.interrupt is not None:
+            self.interrupt()
         packet = self.parts.camera.read(timeout_s)
         report = self.parts.lens.poll()
         if report is not None:
@@ -91,9 +95,10 @@ class Stage:
             self.listener(packet)
         return packet
 
-    def rest(self, limit_ms: float) -> LensReport:
-        """Wait until two reports in a row show the same place and no motion; return the last.
+    def rest(self, limit_ms: float, target: Steps | None = None) -> LensReport:
+        """Wait until the lens rests; return the report that says so.
 
+        One report of no motion at *target* says so, or two in a row of no motion at the same place.
         Raises ``LensError`` if the lens is still moving after *limit_ms*.
         """
         deadline = after_ms(self.now_ns(), limit_ms)
@@ -104,7 +109,8 @@ class Stage:
             report = self.report
             if report is None or report is before or report.earliest_ns < asked_ns:
                 continue
-            if before is not None and not report.moving and report.steps == before.steps:
+            there = target is not None and report.steps == target
+            if not report.moving and (there or (before is not None and report.steps == before.steps)):
                 return report
             before = report
         where = "nowhere" if self.report is None else f"{self.to_um(self.report.steps):.1f} um"
@@ -126,7 +132,7 @@ class Stage:
         start = self.parts.lens.position_at(self.now_ns()).steps
         self.parts.lens.move_to(steps, speed_sps)
         way_s = abs(steps - start) / speed_sps + 2 * speed_sps / max(acceleration_sps2, 1.0)
-        return self.rest(300.0 + 3000.0 * way_s)
+        return self.rest(300.0 + 3000.0 * way_s, steps)
 
     def newest_frame(self, limit_ms: float) -> Frame | None:
         """Wait for a frame that was exposed after now; ``None`` if none came."""

@@ -1,14 +1,14 @@
 """What a sweep's events say, while it runs and after it stopped.
 
-While the lens moves only what decides is computed: packets go through the fused kernel into ELP windows, windows into
-the sequential detector. Packets are kept as they came (a copy of their bytes, bounded). After the stop has been sent
-there is time: the kept packets are decoded, cut to the region, put on the lens's path, and the witnesses of
-``vision.crossing`` are asked where focus was.
+While the lens moves two things are computed. Packets go through the fused kernel into ELP windows and windows into the
+sequential detector: that is the direction. And the region's events build their own image, whose sharpness is followed
+tick by tick of travel: that is the passing, because scene motion does not change sharpness, while it turns a product
+with a stale picture negative. After the stop has been sent the witnesses of ``vision.crossing`` are asked where focus
+was.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,48 +18,48 @@ from elpd.events.stream import PacketDecoder
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
 from elpd.vision.crossing import (
-    FLANK,
     LAG_UNEXPLAINED,
     ROI_MARGIN_PX,
     UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
-    EventStretch,
     Witness,
-    ask_events,
     frame_witness,
     fuse,
 )
 from elpd.vision.detector import SIGMAS, Detector, RestingRate
 from elpd.vision.elp import ElpWindows
-from elpd.vision.filters import PixelCap
+from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
-from elpd.vision.refractory import refractory_period_us
-from elpd.vision.track import EventEnergy, FrameEnergy, PeakTrack
+from elpd.vision.ruler import Ruler
+from elpd.vision.track import FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
     from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi
     from elpd.vision.reference import Reference
 
 REST_WINDOW_US = 1000
-KEEP_BYTES = 256 * 1024 * 1024
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
 
-MIN_EVENTS = 1_000
-TICKS_PER_DEPTH_OF_FOCUS = 4
 LOOK_BACK_DOF = 12.0
-"""The curve of sharpness is drawn this far back from the stop: a peak is five depths of focus wide."""
+"""Losses this far back from the decision count against it: the witnesses look no further."""
+
+TICK_DOF = 0.5
+"""Travel between two looks at the sharpness of the image that the events build."""
+
+PATIENCE_DOF = 8.0
+"""How far beyond a sign change of ELP the image's sharpness may take to agree: a curve's width and a half."""
 
 LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
 
-FAR_DROP = 0.6
-"""How far down the far side of the peak the witnesses look, in log S: about as far as the flank this side."""
+
+FAR_DROP = 0.2
+"""Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
+answers are worth the few micrometres."""
 
 SIGMAS_AFTER_REVERSAL = 9.0
 """A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
@@ -129,11 +129,10 @@ class Watch:
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
-        self._fine_windows: ElpWindows | None = None
-        self._fine_detector = Detector()
         self._decoder = PacketDecoder(geometry)
-        self._kept: deque[CameraPacket] = deque()
-        self._kept_bytes = 0
+        self._memory = EventMemory(roi, geometry)
+        self._ticked_um = self._here_um = float("nan")
+        self._passed = False
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
         self._sign = 1
@@ -176,16 +175,12 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        for packet in self._kept:  # the decoder's registers must not miss what lies between the directions
-            self._decoder.feed(packet)
-        self._kept.clear()
-        self._kept_bytes = 0
+        self._memory = EventMemory(self._roi, self._geometry)
+        self._ticked_um = self._here_um = float("nan")
+        self._passed = False
         if self._windows is None:
-            options: dict[str, Any] = {"window_us": self._window_us, "rate_cap": True}
-            self._windows = ElpWindows(self._reference.weights, self._inside, **options)
-            self._fine_windows = ElpWindows(self._reference.fine, self._inside, **options)
+            self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
         self._detector = Detector(self._rest, recede_sigmas=SIGMAS if turned_at_um is None else SIGMAS_AFTER_REVERSAL)
-        self._fine_detector = Detector()
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
@@ -198,23 +193,23 @@ class Watch:
     def feed(self, packet: CameraPacket) -> list[ElpSample]:
         """Judge one packet; return the windows it closed."""
         assert self._windows is not None, "begin() comes before feed()"
-        assert self._fine_windows is not None
         self.keep(packet)
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
-        fine_rows = self._fine_windows.feed(packet)
-        for row, fine in zip(self._windows.feed(packet), fine_rows, strict=True):
+        for row in self._windows.feed(packet):
             sample = self._located(row)
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
+            self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
             self._detector.feed(sample)
-            self._fine_detector.feed(replace(sample, elp=int(fine["elp"]), energy=int(fine["energy"])))
-            if self.passed and self.decided_us is None:
+            seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
+            if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
+                self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
         self.events_in_cycle += sum(sample.n_on + sample.n_off for sample in samples)
@@ -223,33 +218,45 @@ class Watch:
         return samples
 
     def keep(self, packet: CameraPacket) -> None:
-        """Keep a copy for the estimate; the oldest go when there are too many."""
+        """Remember a packet's events for the estimate."""
         if packet.complete_until_us is not None:
             self._last_us = packet.complete_until_us
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
-        copy = replace(packet, data=packet.data.copy(), frames=(), triggers=())
-        self._kept.append(copy)
-        self._kept_bytes += copy.data.nbytes
-        while self._kept_bytes > KEEP_BYTES:
-            oldest = self._kept.popleft()
-            self._kept_bytes -= oldest.data.nbytes
-            self._decoder.feed(oldest)
+        events = self._decoder.feed(packet)
+        if self._passed:
+            return  # a motor that brakes late goes far beyond what is of interest
+        first = int(np.searchsorted(events.t, self._begun_us, side="left"))
+        self._memory.add(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+
+    def _tick(self, sample: ElpSample, end_um: float) -> None:
+        """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
+        if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
+            return
+        self._ticked_um = self._here_um = end_um
+        self._memory.advance(sample.end_us, self._sign * end_um)
 
     @property
     def passed(self) -> bool:
-        """Whether the sign mutation is certain: focus has been passed.
+        """Whether focus has certainly been passed.
 
-        The fine weights see it first, near focus; they have no say before the coarse ones know that focus was ahead,
-        because far from focus a lens inverts fine contrast.
+        The image has become as sharp as it gets and duller again, and its product with the reference, the ELP, has said
+        that focus was ahead: by the coarse weights, which know the direction from far away.
         """
-        if self._detector.mutation is not None:
-            return True
-        return self._detector.direction is Direction.APPROACHING and self._fine_detector.mutation is not None
+        return self._passed
 
     @property
     def direction(self) -> Direction:
-        """Where focus lies, as far as the events have said."""
+        """Where focus lies, as far as the events have said.
+
+        Once ELP has said "ahead", a change of its mind is no reason to turn round at once: with a picture from far away
+        it comes some depths of focus early, and the sharpness of the image has the say.
+        """
+        mutation = self._detector.mutation
+        if mutation is not None and not self._passed:
+            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
+            if beyond_um < PATIENCE_DOF * self._settings.depth_of_focus_um:
+                return Direction.APPROACHING
         return self._detector.direction
 
     @property
@@ -265,20 +272,23 @@ class Watch:
 
         Decodes what was kept: milliseconds, after the stop has been sent.
         """
-        stretch = self._stretch()
-        if stretch is None:
+        if self.decided_us is None:
             return None
-        track = self._draw(stretch)
-        if track is None:
+        memory = self._memory
+        ruler = self._ruler(self._begun_us, self.decided_us)
+        deaf = memory.refractory()
+        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
+        if said is None:
             return None
-        peak_um, end_um = track.positions[track.peak], self._far_side(track)
-        said = ask_events(
-            _until(stretch, end_um), track.positions[track.flank(FLANK)], peak_um, end_um, self._brightness()
-        )
-        unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
+        speed_um_us = 1e-6 * self._settings.speed_um_s
+        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
-        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um, unexplained, width_um)])
+        witnesses = [
+            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
+            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+        ]
+        found = fuse([*self._ask_frames(), *witnesses])
         if found is None:
             return None
         sign = self._sign
@@ -304,7 +314,7 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
-        for row in self._windows.feed(packet):  # fine windows rest: they are not judged any more
+        for row in self._windows.feed(packet):
             self.events_in_cycle += int(row["n_on"] + row["n_off"])
 
     # --- pieces ---
@@ -329,94 +339,11 @@ class Watch:
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
-        if self._fine_windows is not None:
-            self._fine_windows.set_weights(self._reference.fine, self._inside)
 
-    def _stretch(self) -> EventStretch | None:
-        """Decode the kept packets: the region's events while the lens moved the right way, on its path."""
-        roi, geometry = self._roi, self._geometry
-        left, top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
-        right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
-        bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
-        parts: list[tuple[NDArray[Any], ...]] = []
-        while self._kept:
-            events = self._decoder.feed(self._kept.popleft())
-            inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-            parts.append(
-                (events.t[inside], events.x[inside] - left, events.y[inside] - top, events.p[inside])
-            )
-        self._kept_bytes = 0
-        if not parts:
-            return None
-        t_us, x, y, on = (np.concatenate(column) for column in zip(*parts, strict=True))
-        height, width = bottom - top, right - left
-        moving = self._moving(t_us)
-        keep = PixelCap(height, width).keep(t_us, x.astype(np.uint16), y.astype(np.uint16)) & moving
-        t_us = np.ascontiguousarray(t_us[keep])
-        if t_us.size < MIN_EVENTS:
-            return None
-        x, y = x[keep].astype(np.uint16), y[keep].astype(np.uint16)
-        deaf_us = refractory_period_us(t_us, x, y, (height, width))
-        return EventStretch(
-            t_us,
-            x,
-            y,
-            on[keep].astype(np.uint8),
-            self._sign * self._path(t_us + round(deaf_us)),
-            height,
-            width,
-            ROI_MARGIN_PX,
-        )
-
-    def _moving(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mark the events of the stretch in which the lens moved in the direction of this sweep."""
-        grid, path_um = self._grid(int(t_us[0]), int(t_us[-1])) if t_us.size else (np.zeros(1), np.zeros(1))
-        forward = self._sign * np.diff(path_um) > SLOW_SHARE * 1e-6 * self._settings.speed_um_s * PATH_STEP_US
-        steps = np.flatnonzero(forward)
-        if steps.size == 0:
-            return np.zeros(t_us.size, np.bool_)
-        last = int(steps[-1])
-        first = last
-        while first > 0 and forward[first - 1]:
-            first -= 1
-        return np.asarray((t_us >= max(grid[first], self._begun_us)) & (t_us < grid[last + 1]))
-
-    def _path(self, t_us: NDArray[np.int64]) -> NDArray[np.float64]:
-        grid, path_um = self._grid(int(t_us[0]), int(t_us[-1]))
-        return np.asarray(np.interp(t_us, grid, path_um))
-
-    def _grid(self, begin_us: int, end_us: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        grid = np.arange(begin_us - PATH_STEP_US, end_us + 2 * PATH_STEP_US, PATH_STEP_US)
-        path_um = np.array([self._locate(SensorUs(int(when))) for when in grid])
-        return grid.astype(np.float64), path_um
-
-    def _draw(self, stretch: EventStretch) -> PeakTrack | None:
-        """Draw the curve of log sharpness of the image that the events built, over the last part of the sweep."""
-        step_um = self._settings.depth_of_focus_um / TICKS_PER_DEPTH_OF_FOCUS
-        end_um = float(stretch.position[-1])
-        begin_um = max(float(stretch.position[0]), end_um - LOOK_BACK_DOF * self._settings.depth_of_focus_um)
-        if end_um - begin_um < 4 * step_um:
-            return None
-        ticks_um = np.arange(begin_um, end_um + 0.5 * step_um, step_um)
-        ends = np.searchsorted(stretch.position, ticks_um, side="right")
-        energy = EventEnergy(stretch.height, stretch.width, stretch.margin)
-        track = PeakTrack()
-        taken = 0
-        for tick_um, until in zip(ticks_um, ends, strict=True):
-            part = slice(taken, int(until))
-            energy.add(stretch.x[part], stretch.y[part], stretch.on[part])
-            taken = int(until)
-            track.add(int(stretch.t_us[max(0, taken - 1)]), float(tick_um), energy.measure())
-        return track if track.positions[track.peak] > track.positions[track.flank(FLANK)] else None
-
-    @staticmethod
-    def _far_side(track: PeakTrack) -> float:
-        """Return where the far side of the peak has said enough: what comes later only blurs the answer."""
-        top = track.values[track.peak]
-        for value, position in zip(track.values[track.peak :], track.positions[track.peak :], strict=True):
-            if value < top - FAR_DROP:
-                return position
-        return track.positions[-1]
+    def _ruler(self, begin_us: int, end_us: int) -> Ruler:
+        """Return the lens's path between two sensor times, finely sampled."""
+        grid = np.arange(begin_us, end_us + 4 * PATH_STEP_US, PATH_STEP_US, dtype=np.float64)
+        return Ruler.of_path(grid, np.array([self._locate(SensorUs(int(when))) for when in grid]))
 
     def _ask_frames(self) -> list[Witness]:
         """Ask the frames of this sweep, where three or more saw focus come and go."""
@@ -429,23 +356,3 @@ class Watch:
         if vertex is None:
             return []
         return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]
-
-    def _brightness(self) -> NDArray[np.float32]:
-        roi, geometry = self._roi, self._geometry
-        left, top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
-        right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
-        bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
-        return np.ascontiguousarray(self._reference.brightness[top:bottom, left:right])
-
-
-def _until(stretch: EventStretch, end_um: float) -> EventStretch:
-    """Cut a stretch off at a position."""
-    count = int(np.searchsorted(stretch.position, end_um, side="right"))
-    return replace(
-        stretch,
-        t_us=stretch.t_us[:count],
-        x=stretch.x[:count],
-        y=stretch.y[:count],
-        on=stretch.on[:count],
-        position=stretch.position[:count],
-    )

@@ -37,7 +37,8 @@ class Motion:
     """What was commanded: a velocity, an absolute target, or a halt (``velocity_sps`` 0, infinite acceleration).
 
     ``speed_sps`` bounds the way to ``target_steps`` and is unused otherwise. ``segment_s`` is the length of the
-    firmware's constant-speed segments, 0 for none.
+    firmware's constant-speed segments, 0 for none. ``rounding_steps`` is one standard deviation of what the firmware
+    adds by itself (a stop goes on to the next whole step).
     """
 
     acceleration_sps2: float
@@ -45,6 +46,7 @@ class Motion:
     target_steps: float | None = None
     speed_sps: float = 0.0
     segment_s: float = 0.0
+    rounding_steps: float = 0.0
 
     def pieces(self, steps: float, velocity_sps: float) -> tuple[Piece, ...]:
         """Plan the motion from a state."""
@@ -60,7 +62,7 @@ class Motion:
         return velocity_sps != 0.0 and abs(abs(velocity_sps) - cruise) > 1e-6 * max(cruise, 1.0)
 
 
-REST = Motion(acceleration_sps2=math.inf)
+REST = Motion(acceleration_sps2=math.inf, rounding_steps=0.3)
 """A halt without a ramp."""
 
 
@@ -301,7 +303,7 @@ class Trajectory:
         before, epoch = self._epochs[index - 1], self._epochs[index]
         start, motion = epoch.start_ns, epoch.motion
         steps, velocity, h_offset, h_delay = before.depends(start)
-        epoch.steps, epoch.variance = steps, before.learnt(h_offset, h_delay)
+        epoch.steps, epoch.variance = steps, before.learnt(h_offset, h_delay) + motion.rounding_steps**2
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
         further = steps + _FURTHER_STEPS
         epoch.further = lay_out(start, further, motion.pieces(further, velocity))

@@ -152,7 +152,8 @@ def _read_events(path: Path) -> tuple[dict[str, NDArray[Any]], Geometry | None, 
 
 def _columns_of_npy(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        array = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            array = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"{path}: not a numpy file of events ({error})") from None
     return _columns_of_array(array, path)
@@ -160,7 +161,7 @@ def _columns_of_npy(path: Path) -> dict[str, NDArray[Any]]:
 
 def _columns_of_npz(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: not an .npz archive of events ({error})") from None

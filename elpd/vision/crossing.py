@@ -58,6 +58,10 @@ UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
 
 TICKS = 64
+FEWEST_TICKS = 24
+LEVELS_AT_ONCE = 1 << 24
+"""Pixels times ticks of a rebuilt curve, four bytes each: a whole megapixel is rebuilt at fewer ticks."""
+
 FLANK = 0.6
 ROI_MARGIN_PX = 14
 
@@ -161,7 +165,8 @@ def ask_events(
     *brightness*, (height, width) of the cut-out, relative to the brightest parts, tells how slow each pixel's
     photoreceptor is; with it, the pairs themselves measure the lag, and both witnesses are freed of it.
     """
-    ticks = np.linspace(begin, end, TICKS)
+    pixels = max(1, events.height * events.width)
+    ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     weight, slowness = _by_brightness(brightness, events)
     vertex, level_at_peak = _vertex(events, ticks, peak, weight)
     pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness)

@@ -33,6 +33,7 @@ RELATIVE_DRAWDOWN = 0.1
 
 _DISPERSION_WINDOWS = 64
 _MIN_EVENTS_FOR_VERDICT = 30
+_MIN_DIFFERENCES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +47,11 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class RestingRate:
-    """What the region says while nothing moves, per microsecond: mean of ELP, and events."""
+    """What the region says while nothing moves: mean of ELP and events per microsecond, and how it scatters."""
 
     elp_per_us: float = 0.0
     events_per_us: float = 0.0
+    overdispersion: float = 1.0
 
 
 class Detector:
@@ -65,9 +67,7 @@ class Detector:
         How certain a first verdict of receding must be: more after a reversal, because a false one costs the most.
     """
 
-    def __init__(
-        self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS
-    ) -> None:
+    def __init__(self, rest: RestingRate | None = None, arm_after_us: int = 0, recede_sigmas: float = SIGMAS) -> None:
         self.rest = rest or RestingRate()
         self.recede_sigmas = recede_sigmas
         self.arm_after_us = arm_after_us
@@ -89,11 +89,16 @@ class Detector:
 
     @property
     def overdispersion(self) -> float:
-        """How much larger the scatter of successive windows is than that of independent events; at least one."""
+        """How much larger the scatter of successive windows is than that of independent events; at least one.
+
+        A standard error is added: a few windows that happen to agree prove little.
+        """
         variance = sum(energy for _, energy in self._differences)
         if variance <= 0.0:
-            return 1.0
-        return max(1.0, sum(square for square, _ in self._differences) / variance)
+            return self.rest.overdispersion
+        doubt = 1.0 + float(np.sqrt(2.0 / len(self._differences)))
+        measured = doubt * sum(square for square, _ in self._differences) / variance
+        return max(1.0, self.rest.overdispersion, measured)
 
     @property
     def likely_crossing_us(self) -> int | None:
@@ -157,6 +162,8 @@ class Detector:
         return round(t0 + (t1 - t0) * rate0 / (rate0 - rate1)) if rate0 > 0.0 else self._high_us
 
     def _judge(self, sample: ElpSample) -> None:
+        if len(self._differences) < _MIN_DIFFERENCES:
+            return
         rally = self._total - self._low
         drawdown = self._high - self._total
         if (

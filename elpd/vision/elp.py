@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
+from elpd.events.epoch import enter_epoch
 from elpd.events.layout import event_columns
 from elpd.events.registers import (
     counters,
@@ -103,6 +104,7 @@ class ElpWindows:
         self._triggers = new_triggers()
         self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
+        self._pending = (np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64))
         self._words = (
             {
                 Encoding.EVT3: elp_words.evt3_to_windows_capped,
@@ -172,18 +174,20 @@ class ElpWindows:
         until_us = NEVER if packet.complete_until_us is None else packet.complete_until_us
         if packet.encoding is Encoding.ARRAY:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
+        enter_epoch(packet, self._state)
         sum_words = self._words[packet.encoding]
+        scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
         words = packet.data
         window = self._window
         window[N_ROWS] = 0
         position = sum_words(
-            words, 0, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us, self._bucket
+            words, 0, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us, *scratch
         )
         while window[PAUSED]:
             self._make_room()
             position = sum_words(
                 words, position, self._state, self._triggers, self._table, window, self._edges, self._rows, until_us,
-                self._bucket,
+                *scratch,
             )  # fmt: skip
         return self._closed[: window[N_ROWS]]
 

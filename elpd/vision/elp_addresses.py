@@ -37,7 +37,7 @@ from elpd.vision.elp_windows import (
     OUTSIDE,
     move_to,
 )
-from elpd.vision.elp_words import DEPTH_US, REFILL_US, store_sums
+from elpd.vision.elp_words import DEPTH_US, REFILL_US
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,6 +83,18 @@ def add_event(
     window[ENERGY] += weight * weight
     window[N_ON] += on
     window[N_OFF] += 1 - on
+
+
+@kernel()
+def store_sums(
+    window: NDArray[np.int64], elp: Integer, energy: Integer, n_on: Integer, n: Integer, n_capped: Integer
+) -> None:
+    """Put the sums of the open window back where they are kept."""
+    window[ELP] = elp
+    window[ENERGY] = energy
+    window[N_ON] = n_on
+    window[N_OFF] = n - n_on
+    window[N_CAPPED] = n_capped
 
 
 def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)

@@ -35,7 +35,11 @@ _BAND_RATIO = 1.6
 
 
 def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
-    """Return the weighted mean square of one band of *image*, leaving *margin* pixels at each side out of the mean."""
+    """Return the weighted mean square of one band of *image*, leaving *margin* pixels at each side out of the mean.
+
+    Of a small image less is left out: at least its middle eight pixels are measured.
+    """
+    margin = max(0, min(margin, (min(image.shape) - 8) // 2))
     inner = cv2.GaussianBlur(image, (0, 0), scale_px)
     inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
     inside = slice(margin, -margin or None)

@@ -9,13 +9,14 @@ picture, and the vertex does not depend on the start picture.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -31,9 +32,15 @@ MIN_EVENTS = 1_000
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
+FIRST_CAPACITY = 1 << 17
+
 LEAST_LEVEL = 1.0 / 3.0
 """Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
 event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
+
+LEAST_ORDER = 0.75
+"""Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
+motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
 
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
@@ -58,12 +65,12 @@ class EventMemory:
         self._cap = PixelCap(height, width)
         self._energy = EventEnergy(height, width, ROI_MARGIN_PX)
         self._shape = (height, width)
-        self._t_us = np.empty(0, dtype=np.int64)
-        self._x = self._y = np.empty(0, dtype=np.uint16)
-        self._on = np.empty(0, dtype=np.uint8)
+        self._columns = _columns(FIRST_CAPACITY)
+        self._count = 0
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
+        self._forgotten = 0
         self.capped = 0
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
@@ -75,19 +82,45 @@ class EventMemory:
         y = (y[inside] - self._top).astype(np.uint16)
         keep = self._cap.keep(t_us, x, y)
         self.capped += int(keep.size - keep.sum())
-        # Growth by doubling is numpy's business no more than ours: sweeps are added in a few large pieces.
-        drop = min(max(0, self._t_us.size + int(keep.sum()) - self._max_events), self._taken)
-        self._t_us = np.concatenate([self._t_us[drop:], t_us[keep]])
-        self._x = np.concatenate([self._x[drop:], x[keep]])
-        self._y = np.concatenate([self._y[drop:], y[keep]])
-        self._on = np.concatenate([self._on[drop:], on[keep]])
+        count = int(keep.sum())
+        self._make_room(count)
+        part = slice(self._count, self._count + count)
+        events: tuple[NDArray[Any], ...] = (t_us, x, y, on)
+        for column, values in zip(self._columns, events, strict=True):
+            column[part] = values[keep]
+        self._count += count
+
+    def _make_room(self, count: int) -> None:
+        """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""
+        used, capacity = self._count, self._columns[0].size
+        if used + count <= capacity:
+            return
+        drop = min(max(0, used + count - self._max_events), self._taken)
+        capacity = max(capacity, min(2 * capacity, self._max_events), used - drop + count)
+        columns = _columns(capacity)
+        for new, old in zip(columns, self._columns, strict=True):
+            new[: used - drop] = old[drop:used]
+        self._columns = columns
+        self._count -= drop
         self._taken -= drop
+        self._forgotten += drop
+
+    @property
+    def _t_us(self) -> NDArray[np.int64]:
+        times: NDArray[np.int64] = self._columns[0][: self._count]
+        return times
+
+    def refractory(self) -> Refractory:
+        """Return how long a pixel is deaf after an event, as far as the events tell."""
+        t_us, x, y, _ = (column[: self._count] for column in self._columns)
+        return refractory_period(t_us, x, y, self._shape)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
         until = int(np.searchsorted(self._t_us, until_us, side="left"))
         part = slice(self._taken, until)
-        self._energy.add(self._x[part], self._y[part], self._on[part])
+        _, x, y, on = self._columns
+        self._energy.add(x[part], y[part], on[part])
         self._taken = until
         self.track.add(until_us, position, self._energy.measure())
 
@@ -97,13 +130,26 @@ class EventMemory:
         track = self.track
         if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
             return False
+        if not self._shows_a_picture():
+            return False
         begin_us = track.times_us[track.flank(FLANK)]
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
 
-    def ask(self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None) -> EventWitnesses | None:
+    def _shows_a_picture(self) -> bool:
+        """Whether the image is sharper, at its peak, than as many events at random would have made it."""
+        track = self.track
+        height, width = self._shape
+        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
+        at_random = band_gain(BANDS_PX[0]) * until / (height * width)
+        return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
+
+    def ask(
+        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None, deaf_us: float = 0.0
+    ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
-        *brightness* is that of the whole sensor (``Reference.brightness``). ``None`` when there is nothing to ask.
+        *brightness* is that of the whole sensor (``Reference.brightness``); events are dated *deaf_us* later, to the
+        release of their pixels. ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -116,11 +162,10 @@ class EventMemory:
         if peak_us <= flank_us:
             return None
         part = slice(begin, self._taken)
-        position = sign * ruler.at(self._t_us[part])
+        position = sign * ruler.at(self._t_us[part] + round(deaf_us))
         height, width = self._shape
-        events = EventStretch(
-            self._t_us[part], self._x[part], self._y[part], self._on[part], position, height, width, ROI_MARGIN_PX
-        )
+        t_us, x, y, on = (column[part] for column in self._columns)
+        events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX)
         if brightness is not None:
             brightness = np.ascontiguousarray(brightness[self._top : self._bottom, self._left : self._right])
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
@@ -136,3 +181,13 @@ class EventMemory:
         _, _, sign = ruler.stretch(now_us)
         lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
         return [replace(one, at=sign * one.at) for one in said.witnesses(lag)], said.vertex.width
+
+
+def _columns(capacity: int) -> tuple[NDArray[Any], ...]:
+    """Return room for events: times, x, y, polarity."""
+    return (
+        np.empty(capacity, np.int64),
+        np.empty(capacity, np.uint16),
+        np.empty(capacity, np.uint16),
+        np.empty(capacity, np.uint8),
+    )

@@ -60,16 +60,12 @@ class Reference:
     brightness:
         Linear intensity relative to the brightest parts of the ROI, (height, width) ``float32``: how fast a pixel's
         photoreceptor is, and how much its events are worth when energies are summed.
-    fine:
-        As ``weights``, from the finest scale that stands out of the noise alone: the first to see that focus has been
-        passed, but not to be trusted with the direction from far away.
     """
 
     weights: NDArray[np.int16]
     texture: float
     scale_px: float
     brightness: NDArray[np.float32]
-    fine: NDArray[np.int16]
 
     @property
     def textured(self) -> bool:
@@ -161,10 +157,7 @@ def _build(
         response, coarse = response / local, coarse / local
     # Near focus events follow the fine structure; far from it only the coarse is left of the picture.
     weights = _quantise(_unit(response, usable) + _unit(coarse, usable), usable)
-    finest = responses[int(np.argmax(structure > 0.0))]
-    if ground is not None:
-        finest = finest / local
-    return Reference(weights, float(texture), chosen, brightness, _quantise(finest, usable))
+    return Reference(weights, float(texture), chosen, brightness)
 
 
 def _unit(response: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -212,9 +212,12 @@ def temporal_image(
     """
     if open_us is None:
         open_us = find_opening(first)
-    since_open_us = first.times_us.astype(np.float64) + (first.begin_us - open_us + TIMESTAMP_STEP_US / 2)
-    passed = transmittance(since_open_us)
     fired = first.times_us != EMPTY
+    offset_us = first.begin_us - open_us + TIMESTAMP_STEP_US / 2
+    since_open_us = first.times_us.astype(np.float64) + offset_us
+    # Times are whole microseconds: ask the profile once for each that occurs, not once for each pixel.
+    stamps, which = np.unique(first.times_us, return_inverse=True)
+    passed = transmittance(stamps.astype(np.float64) + offset_us)[which].reshape(fired.shape)
     valid = fired & (since_open_us > 0) & (passed > 0)
     if not valid.any():
         raise UsageError(

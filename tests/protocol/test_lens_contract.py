@@ -135,6 +135,49 @@ def test_a_stop_right_after_the_command_that_moves_is_not_lost(kind: str) -> Non
         assert not made.moving, gap_ms
 
 
+def test_a_stop_from_another_thread_wins_over_a_command_that_is_just_being_written(kind: str) -> None:
+    made = open_rig(kind)
+    made.live(20)
+    write, stops = made.port.write, []
+
+    def write_late(data: bytes) -> None:
+        if data.startswith(b"$J") or b"\xe0" in data:
+            made.port.write = write  # type: ignore[method-assign]
+            stops.append(made.lens.stop(StopMode.RAMPED))
+        write(data)
+
+    made.port.write = write_late  # type: ignore[method-assign]
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    assert stops
+    made.live(250)
+    assert not made.moving
+    assert made.rotor < 3200 + 1500
+
+
+def test_replies_that_come_twice_do_no_harm(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    twice = iter([True] * 4)
+    made.port.faults.garble = lambda data: data * 2 if next(twice, False) else data
+    made.live(300)
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
+
+
+def test_the_end_stop_behind_a_false_reference_is_not_ground_against(kind: str) -> None:
+    made = open_rig(kind)
+    made.motor.slip(made.clock.now_ns(), 600.0)
+    made.lens.run(-SPEED_SPS, made.soon(3000))
+    try:
+        made.live(600)
+    except LensError:
+        made.clock.pass_ms(5)
+    else:
+        assert LensFlag.LIMIT in made.reports[-1].flags
+        assert LensFlag.REFERENCED not in made.reports[-1].flags
+    assert not made.moving
+    assert made.rotor >= -3.0
+
+
 def test_requests_that_make_no_sense_are_refused_and_nothing_moves(kind: str) -> None:
     made = open_rig(kind)
     with pytest.raises(UsageError, match="outside the travel"):

@@ -163,7 +163,9 @@ def sim_board(*arguments: str) -> subprocess.Popen[str]:
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_ticlib_drives_elpd_sim_board(ending: signal.Signals) -> None:
-    with sim_board("tic", "--json", "--set", "start_um=500", "--set", "board.referenced=true") as process:
+    with sim_board(
+        "tic", "--json", "--set", "start_um=500", "--set", "board.referenced=true", "--set", "sim.seed=4"
+    ) as process:
         assert process.stdout is not None
         port = json.loads(process.stdout.readline())["port"]
         with serial.Serial(port, 115_200, timeout=20, write_timeout=20) as line:
@@ -203,6 +205,8 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),
+        (["tic", "--set", "sim.seed=x"], "sim.seed"),
+        (["tic", "--set", "lens.um_per_step=-1"], "lens.um_per_step"),
     ],
 )
 def test_elpd_sim_board_refuses_what_it_does_not_know(arguments: list[str], words: str) -> None:

@@ -276,7 +276,7 @@ def test_no_stream_writes_outside_rows_nor_reads_outside_the_table(seed: int, n_
     table = weight_table(np.ones((1, 1), np.int64))
     elp_words.evt3_to_windows(
         words, 0, new_state(), new_triggers(), table, window, edges[4 : 4 + n_edges], rows[4 : 4 + n_rows], NEVER,
-        np.zeros(1, np.int64),
+        np.zeros(1, np.int64), np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64),
     )  # fmt: skip
     assert (rows[:4] == 123).all()
     assert (rows[4 + n_rows :] == 123).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from itertools import pairwise
 
 import numpy as np
@@ -183,6 +184,39 @@ def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms
     assert rms_um(live) <= live_rms_um
     assert rms_um(late) <= late_rms_um
     assert max(map(abs, rest)) * UM_PER_STEP <= rest_um
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_stays_honest_under_any_commands(kind: str) -> None:
+    covered: list[bool] = []
+    for seed in range(5):
+        choose = random.Random(seed)
+        made = rig(kind, seed=seed, start_um=1250.0)
+        made.open()
+        asked: list[int] = []
+        given_then = []
+
+        def ask(made=made, asked=asked, given_then=given_then) -> None:  # noqa: ANN001
+            made.poll()
+            asked.append(made.clock.now_ns())
+            given_then.append(made.lens.position_at(made.clock.now_ns()))
+
+        for _ in range(8):
+            what = choose.choice(["run", "run", "move", "stop"])
+            if what == "run":
+                way = choose.choice([-1, 1])
+                made.lens.run(way * choose.uniform(2000, 20_000), made.soon(choose.uniform(50, 400)))
+            elif what == "move":
+                made.lens.move_to(choose.randint(500, 7500), choose.uniform(2000, 30_000))
+            else:
+                made.lens.stop(StopMode.RAMPED)
+            made.live(choose.uniform(5, 250), ask)
+        truth = made.truth(asked)
+        assert -1e-6 <= truth.min() <= truth.max() <= 8000 + 1e-6, "limits always hold"
+        for estimates in (given_then, _again(made, asked)):
+            gap = np.array([e.steps for e in estimates]) - truth
+            covered.extend(np.abs(gap) < 2 * np.array([e.sigma_steps for e in estimates]))
+    assert np.mean(covered) >= 0.95
 
 
 def _again(made, asked):  # noqa: ANN001, ANN202

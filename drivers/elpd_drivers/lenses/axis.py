@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+ADAPTER_LATENCY_US, ADAPTER_LATENCY_SIGMA_US = 600.0, 350.0
+"""What a USB adapter and a board take over a command when nobody has measured them: a USB frame is 1 ms."""
+
 
 def read_settings(kind: type[T], settings: Mapping[str, Any], where: str) -> T:
     """Build the settings dataclass *kind* from a table, refusing unknown keys and wrong types by name."""

@@ -16,14 +16,22 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
 from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
-from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, read_settings, run_target
+from elpd_drivers.lenses.axis import (
+    ADAPTER_LATENCY_SIGMA_US,
+    ADAPTER_LATENCY_US,
+    check_speed,
+    check_target,
+    limits_from,
+    read_settings,
+    run_target,
+)
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
     ALARM_WORDS,
@@ -65,6 +73,8 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
         from elpd_drivers.lenses.serial_port import SerialPort  # noqa: PLC0415  (needs pyserial, in-memory use does not)
 
         port = SerialPort(table.port, table.baud)
+        if "latency_us" not in settings:
+            table = replace(table, latency_us=ADAPTER_LATENCY_US, latency_sigma_us=ADAPTER_LATENCY_SIGMA_US)
     lens = GrblLens(table, clock, port)
     try:
         lens.connect()
@@ -99,7 +109,7 @@ class GrblLens:
         self._referenced = False
         self._implausible = 0
         self._rest_due_ns: int | None = None
-        self._stops_ignored = 0
+        self._stops = self._stops_ignored = 0
         self._fault: str | None = None
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
@@ -176,6 +186,7 @@ class GrblLens:
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte now, from any thread. ``ABRUPT`` is a reset: the position is lost if in motion."""
+        self._stops += 1
         self._wish = None
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
@@ -212,9 +223,9 @@ class GrblLens:
 
     def _begin(self, wish: _Wish, name: str) -> CommandStamp:
         """Jog now if at rest; else cancel, and let ``poll`` jog when the motor stands."""
-        now = self._clock.now_ns()
+        now, stops = self._clock.now_ns(), self._stops
         if not self._busy():
-            return self._jog(wish, name)
+            return self._jog(wish, name, stops)
         if wish.target is None and wish.speed_sps == self._cruise_sps and not self._stopping:
             due = self._rest_due_ns or now
             if due <= wish.until_ns:
@@ -226,7 +237,7 @@ class GrblLens:
     def _busy(self) -> bool:
         return self._rest_due_ns is not None or bool(self._unacknowledged)
 
-    def _jog(self, wish: _Wish, name: str) -> CommandStamp:
+    def _jog(self, wish: _Wish, name: str, stops: int) -> CommandStamp:
         if self._status is not None and self._status.state == "Alarm":
             raise LensError("lens: GRBL is locked (Alarm), its position is unknown; home it first")
         now = self._clock.now_ns()
@@ -248,8 +259,11 @@ class GrblLens:
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 100 * NS_PER_MS
         self._unacknowledged.append(number)
         self._write(line)
+        done = self._clock.now_ns()
         self._cruise_sps, self._stopping, self._stops_ignored = wish.speed_sps, False, 0
-        return CommandStamp(name, begun, self._clock.now_ns())
+        if self._stops != stops:
+            self.stop(StopMode.RAMPED)  # one came from another thread while this was on its way: it wins
+        return CommandStamp(name, begun, done)
 
     def _note_stop(self, mode: StopMode, begun: int) -> None:
         sent = self._on_wire(1, begun)
@@ -272,10 +286,11 @@ class GrblLens:
         self._stopping = True
 
     def _take_next_step(self) -> None:
+        stops = self._stops
         if self._wish is None or self._busy():
             return
         wish, self._wish = self._wish, None
-        self._jog(wish, "run")
+        self._jog(wish, "run", stops)
 
     # --- queries and replies ---------------------------------------------------------------------------------------
 

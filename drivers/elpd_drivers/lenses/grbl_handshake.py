@@ -27,7 +27,8 @@ class GrblLensSettings:
 
     ``um_per_step`` must agree with the board's ``$100``. ``stop_onset_ms`` is the time from a stop byte to the first
     slower segment. ``trust_position`` believes a board that is idle when it is opened; otherwise it must be homed
-    first. ``connect_ms`` is the patience with a board that boots when its port is opened.
+    first. ``latency_us`` and ``latency_sigma_us`` are for real-time bytes; unless given, a real port gets what USB
+    adapters need, which is wider. ``connect_ms`` is the patience with a board that boots when its port is opened.
     """
 
     port: str = ""

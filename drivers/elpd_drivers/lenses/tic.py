@@ -15,7 +15,7 @@ The time at which a position was sampled lies between the query's last byte on t
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
@@ -23,7 +23,15 @@ from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
 from elpd_drivers.lenses import tic_wire as wire
-from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, read_settings, run_target
+from elpd_drivers.lenses.axis import (
+    ADAPTER_LATENCY_SIGMA_US,
+    ADAPTER_LATENCY_US,
+    check_speed,
+    check_target,
+    limits_from,
+    read_settings,
+    run_target,
+)
 from elpd_drivers.lenses.tic_wire import crc7, encode, long_word, parse_reply, reply_length
 
 if TYPE_CHECKING:
@@ -39,7 +47,8 @@ class TicSettings:
     """The table ``[lens]`` for a Tic.
 
     ``latency_us`` is the usual time from a command's last bit to its effect, adapter included, and
-    ``latency_sigma_us`` how well that is known. ``start_stop_um_s`` is the speed from which the motor can halt without
+    ``latency_sigma_us`` how well that is known. Unless given, a real port gets what USB adapters need, which is wider.
+    ``start_stop_um_s`` is the speed from which the motor can halt without
     losing steps. ``crc`` must be what the Tic's own settings say.
     """
 
@@ -71,6 +80,8 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
         from elpd_drivers.lenses.serial_port import SerialPort  # noqa: PLC0415  (needs pyserial, in-memory use does not)
 
         port = SerialPort(table.port, table.baud)
+        if "latency_us" not in settings:
+            table = replace(table, latency_us=ADAPTER_LATENCY_US, latency_sigma_us=ADAPTER_LATENCY_SIGMA_US)
     lens = TicLens(table, clock, port)
     try:
         lens.connect()
@@ -98,10 +109,11 @@ class TicLens:
             settings.max_speed_um_s,
             settings.acceleration_um_s2,
         )
+        self._ramp_to_rest = Motion(self._limits.acceleration_sps2, rounding_steps=0.3)
         self._byte_ns = 10 * NS_PER_S // settings.baud
         sigma_ns = round(settings.latency_sigma_us * NS_PER_US)
         self._latency_ns, self._sigma_ns = round(settings.latency_us * NS_PER_US), sigma_ns
-        self._trajectory = Trajectory(Timing(self._latency_ns, sigma_ns, sigma_ns, quantum_steps=1.0))
+        self._trajectory = Trajectory(Timing(self._latency_ns, sigma_ns, sigma_ns, quantum_steps=1.0, ramp_steps=0.3))
         self._lock = threading.Lock()
         self._line_free_ns = 0
         self._received = bytearray()
@@ -113,9 +125,9 @@ class TicLens:
         self._errors = 0
         self._referenced = False
         self._halted_softly = False
-        self._speed_word = -1
+        self._speed_sps = 0.0
         self._rest_due_ns: int | None = None
-        self._stops_ignored = 0
+        self._stops = self._stops_ignored = 0
         self._implausible = 0
         self._fault: str | None = None
         self._stop_bytes = {
@@ -200,15 +212,17 @@ class TicLens:
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move."""
+        stops = self._stops
         self._check_fault()
         check_target(target, self._limits)
         check_speed(speed_sps, self._limits)
         if not self._referenced:
             raise LensError(f"lens: cannot move to {target} steps, its position is unknown; home it first")
-        return self._go(target, abs(speed_sps), "move_to")
+        return self._go(target, abs(speed_sps), "move_to", stops)
 
     def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
         """Run at a signed velocity, ending at *until* or the limit: a target position that says both."""
+        stops = self._stops
         self._check_fault()
         check_speed(velocity_sps, self._limits)
         with self._lock:
@@ -217,17 +231,18 @@ class TicLens:
             moving_sps = self._trajectory.velocity_at(now)
         spare_ns = until - now - self._latency_ns - 3 * self._sigma_ns - 14 * self._byte_ns
         target = run_target(steps, moving_sps, velocity_sps, spare_ns, self._limits, referenced=self._referenced)
-        return self._go(target, abs(velocity_sps), "run")
+        return self._go(target, abs(velocity_sps), "run", stops)
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte(s) now, from any thread; the books are kept afterwards."""
+        self._stops += 1
         data = self._stop_bytes[mode]
         begun = self._clock.now_ns()
         self._write(data)
         done = self._clock.now_ns()
         with self._lock:
             effective = self._on_wire(len(data), begun) + self._latency_ns
-            motion = REST if mode is StopMode.ABRUPT else Motion(self._limits.acceleration_sps2)
+            motion = REST if mode is StopMode.ABRUPT else self._ramp_to_rest
             if self._trajectory.known:
                 speed = abs(self._trajectory.velocity_at(HostNs(effective)))
                 if mode is StopMode.ABRUPT:
@@ -260,22 +275,32 @@ class TicLens:
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
-    def _go(self, target: int, speed_sps: float, name: str) -> CommandStamp:
+    def _go(self, target: int, speed_sps: float, name: str, stops: int) -> CommandStamp:
         self._prepare()
-        word = max(1, round(speed_sps * 10_000))
-        data = b"" if word == self._speed_word else self._frame(wire.SET_MAX_SPEED, long_word(word))
-        data += self._frame(wire.SET_TARGET_POSITION, long_word(target))
+        aim = self._frame(wire.SET_TARGET_POSITION, long_word(target))
+        limit = self._frame(wire.SET_MAX_SPEED, long_word(max(1, round(speed_sps * 10_000))))
+        motion = Motion(self._limits.acceleration_sps2, target_steps=float(target), speed_sps=speed_sps)
+        # in motion the target goes first: another speed limit alone would accelerate towards the old target
+        steps: list[tuple[bytes, Motion | None]]
+        steps = [(aim, replace(motion, speed_sps=self._speed_sps)), (limit, motion)]
+        if self._speed_sps == speed_sps:
+            steps = [(aim, motion)]
+        elif self._rest_due_ns is None:
+            steps = [(limit, None), (aim, motion)]
         begun = self._clock.now_ns()
-        self._write(data)
+        self._write(b"".join(data for data, _ in steps))
         done = self._clock.now_ns()
-        self._speed_word = word
+        self._speed_sps = speed_sps
         with self._lock:
-            effective = self._on_wire(len(data), begun) + self._latency_ns
-            motion = Motion(self._limits.acceleration_sps2, target_steps=float(target), speed_sps=speed_sps)
-            self._trajectory.command(motion, effective, self._sigma_ns)
+            for data, planned in steps:
+                effective = self._on_wire(len(data), begun) + self._latency_ns
+                if planned is not None:
+                    self._trajectory.command(planned, effective, self._sigma_ns)
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 50 * NS_PER_MS
             self._halted_softly = False
             self._stops_ignored = 0
+        if self._stops != stops:
+            self.stop(StopMode.ABRUPT)  # one came from another thread while this was on its way: it wins
         return CommandStamp(name, begun, done)
 
     def _prepare(self) -> None:

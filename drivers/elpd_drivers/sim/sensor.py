@@ -81,6 +81,8 @@ class EventSensor:
         Draws what happens: noise.
     noise_hz, leak_hz
         Rates per pixel.
+    memories
+        Whether pixels begin focusing with the memories of a running sensor, or all freshly reset.
     """
 
     def __init__(
@@ -94,8 +96,10 @@ class EventSensor:
         leak_hz: float = 0.1,
         hot_pixels: int = 0,
         focus: BiasLevels = FOCUS,
+        memories: bool = True,
     ) -> None:
         self._sets = {BiasSet.EXPOSE: EXPOSE, BiasSet.FOCUS: focus}
+        self._memories = memories
         self._biases = focus
         self._chance = chance
         self._noise_hz = noise_hz
@@ -143,7 +147,9 @@ class EventSensor:
     def apply_biases(self, biases: BiasSet, now_us: int) -> None:
         """Switch thresholds and refractory time; for a few milliseconds the pixels fire without order.
 
-        Moving biases disturb what the pixels remember: at the end of that time all are reset, at their present level.
+        Moving biases disturb what the pixels remember. At the end of that time they hold their present level when they
+        have been made ready for an exposure; ready for focusing, they are where a running sensor's pixels are: anywhere
+        between their two thresholds (``memories``), or all at their present level without.
         """
         self._biases = self._sets[biases]
         self._unsettled_since_us = now_us
@@ -184,8 +190,16 @@ class EventSensor:
         if self._unsettled and begin_us >= self._unsettled_since_us + UNSETTLED_US:
             self._unsettled = False
             self._reference[:] = self.level
+            if self._biases is self._sets[BiasSet.FOCUS] and self._memories:
+                self._reference -= self._left_between_thresholds()
             self._held.fill(0)
             self._apply_mask()
+
+    def _left_between_thresholds(self) -> NDArray[np.float32]:
+        """Draw how far each pixel's level is from what it remembers: evenly, from one threshold to the other."""
+        span = np.float32(self._biases.c_on + self._biases.c_off)
+        drawn: NDArray[np.float32] = self._chance.random(self.level.shape, np.float32)
+        return drawn * (np.float32(0.98) * span) - np.float32(0.98 * self._biases.c_off)
 
     def noise(self, begin_us: int, end_us: int) -> None:
         """Let noise, leakage and hot pixels fire in a part of the span, before the same part's ``step``."""

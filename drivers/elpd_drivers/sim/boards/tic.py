@@ -9,6 +9,7 @@ microsteps/s per 100 s.
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections import deque
@@ -313,7 +314,14 @@ class TicBoard:
         self._watch_switches(at_ns)
 
     def _ramp(self, velocity_sps: float, at_ns: int) -> None:
-        self.lens.set_velocity(at_ns, velocity_sps, self._acceleration_sps2())
+        now_sps, a = self.lens.velocity_at(at_ns), self._acceleration_sps2()
+        if velocity_sps == 0.0 and now_sps != 0.0:
+            # a controller counts whole steps, and rests on one
+            end = self.lens.pulses_at(at_ns) + now_sps * abs(now_sps) / (2 * a)
+            rest = math.ceil(end - 1e-6) if now_sps > 0.0 else math.floor(end + 1e-6)
+            self.lens.move_to(at_ns, rest, abs(now_sps), a)
+        else:
+            self.lens.set_velocity(at_ns, velocity_sps, a)
         self._watch_switches(at_ns)
 
     def _halt(self, at_ns: int) -> None:
