@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 LAMP_HZ = 100.0
 """A lamp on 50 Hz mains."""
 
-GENERATION = 3
+GENERATION = 4
 """Raised whenever the same name and seed would give other events, so that stale files are not used."""
 
 

@@ -1,13 +1,13 @@
 """Pictures to look at: the seven that stand for the paper's seven scenes.
 
-They are the simulated world's own pictures (``elpd_drivers/sim/scenes``, CC0 or public domain, see ``LICENCES.md``
-there), cut to a square and resampled to the benchmark's grid. Grey values are taken for linear intensity, as the paper
-and v2e do.
+They come from scikit-image's example data, CC0 or public domain (``data/scenes/LICENCES.md``), and are the benchmark's
+own copies: what is measured with must not change because a demonstration wants to look different. Each is cut to a
+square and resampled to the grid. Grey values are taken for linear intensity, as the paper and v2e do.
 """
 
 from __future__ import annotations
 
-from importlib.resources import as_file, files
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -16,6 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+PICTURES = Path(__file__).parent / "data" / "scenes"
 SCENES = ("astronaut", "brick", "camera", "chelsea", "coffee", "grass", "gravel")
 BLANKS = ("wall", "card", "cap")
 _BLANK_DN = {"wall": 200.0, "card": 60.0, "cap": 0.0}
@@ -28,8 +29,7 @@ def load_picture(name: str, side: int) -> NDArray[np.float32]:
     """
     if name in _BLANK_DN:
         return np.full((side, side), _BLANK_DN[name], dtype=np.float32)
-    with as_file(files("elpd_drivers.sim") / "scenes" / f"{name}.jpg") as path:
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    grey = cv2.imread(str(PICTURES / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise FileNotFoundError(f"scene {name}: no picture of that name; choose from {', '.join(SCENES)}")
     short = min(grey.shape)
