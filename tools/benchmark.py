@@ -66,7 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for case in cases.values()
     ]
     if not any(work.wanted for work in works):
-        print("benchmark: no case or no method left to run; check --cases, --methods and --rates", file=sys.stderr)
+        print(
+            "benchmark: no case or no method left to run; check --sets, --cases, --recorded, --methods and --rates",
+            file=sys.stderr,
+        )
         return 2
     started = time.perf_counter()
     rows = _run(works, chosen)
@@ -86,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
-    parser.add_argument("--quick", action="store_true", help="six cases of each set only")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few cases of each set: six of syn, three of the rig-like ones"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--executor", choices=EXECUTORS, default="joblib")
     parser.add_argument("--seed", type=int, default=1, help="of motion and sensor noise (default 1)")

@@ -135,6 +135,7 @@ SETS = {
         _rig("davis-bright", "like a DAVIS346, bright", BRIGHT, ("50", "1"), size_px=160, frame_noise_dn=1.0),
         _rig("davis-dark", "like a DAVIS346, dark", DARK, ("20", "1"), size_px=160, frame_noise_dn=4.0),
         _rig("evk4-bright", "like an EVK4, events only, bright", BRIGHT, (MAP,), size_px=240, expose=EXPOSE),
+        _rig("evk4-dark", "like an EVK4, events only, dark", DARK, (MAP,), size_px=240, expose=EXPOSE),
         _rig("flicker", "like a DAVIS346, bright, a lamp of 30 %", BRIGHT, ("50", "1"), size_px=160, flicker=0.3),
         _rig(
             "nothing",
@@ -146,6 +147,5 @@ SETS = {
             fields=(1, 2, 3, 4),
             scenes=BLANKS,
         ),
-        _rig("evk4-dark", "like an EVK4, events only, dark", DARK, (MAP,), size_px=240, expose=EXPOSE),
     )
 }
