@@ -1,4 +1,5 @@
-# `make demo` and `make test` are all the set-up there is: each installs into .venv first, quietly, once.
+# `make demo` and `make test` are all the set-up there is: each installs into .venv first, quietly, once,
+# and compiles the kernels while it is at it.
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -9,8 +10,9 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade pip
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[test]'
+	@$(BIN)/elpd check >.venv/check.log || { cat .venv/check.log; exit 1; }
 	@touch $@
 
 demo: install

@@ -64,7 +64,6 @@ class FocusSection(_Section):
     """LOW_CONFIDENCE above this many depths of focus of standard error."""
     on_failure: Literal["hold", "start", "preset"] = "start"
     preset_um: float | None = None
-    method: Literal["elpd", "paper"] = "elpd"
     transmittance: Literal["profile", "linear", "iris"] = "profile"
     """``profile`` asks the aperture for its own."""
 

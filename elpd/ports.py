@@ -221,6 +221,29 @@ class Truth(Protocol):
         ...
 
 
+@runtime_checkable
+class Scenery(Protocol):
+    """A truth that can show the scene."""
+
+    def picture(self) -> NDArray[np.float32]:
+        """Return what falls on the sensor now, behind an open aperture: log intensity, (height, width)."""
+        ...
+
+    def carriage_error_um(self) -> float:
+        """Return how far the glass is from focus now, signed."""
+        ...
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A clock that tries to keep up with the wall's."""
+
+    @property
+    def lag_s(self) -> float:
+        """How far behind the wall clock it is; negative if ahead, 0 if it does not try."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class RigParts:
     """Devices that share a world: what an entry point of the group ``elpd.rigs`` returns."""

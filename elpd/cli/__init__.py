@@ -8,12 +8,13 @@ that is not the answer goes to stderr.
 from __future__ import annotations
 
 import importlib
+import io
 import sys
 from typing import cast
 
 import click
 
-from elpd import __version__
+from elpd import __version__, log
 from elpd.cli.common import report_error
 from elpd.errors import ElpdError
 
@@ -40,9 +41,8 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import the command's module and return its ``command``."""
-        del ctx
         if cmd_name not in COMMANDS:
-            return None
+            ctx.fail(f"there is no command {cmd_name!r}; there are {', '.join(sorted(COMMANDS))}")
         module = importlib.import_module(f"elpd.cli.{cmd_name.replace('-', '_')}")
         return cast("click.Command", module.command)
 
@@ -53,26 +53,33 @@ class LazyGroup(click.Group):
             formatter.write_dl(sorted(COMMANDS.items()))
 
 
-@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="elpd")
-def root() -> None:
+@click.option("--verbose", "-v", is_flag=True, help="Log what happens, to stderr.")
+def root(*, verbose: bool) -> None:
     """Real-time autofocus for event cameras."""
+    log.configure(verbose=verbose)
 
 
 def main() -> None:
     """Run the command line; every error ends here, without a traceback, with its own exit code."""
     as_json = "--json" in sys.argv
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a curve's dots must not break a terminal of few letters
     try:
         code = root.main(standalone_mode=False)
     except click.exceptions.Abort:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except click.ClickException as error:
-        report_error("UsageError", error.format_message(), as_json=as_json)
+        report_error("UsageError", f"{error.format_message().rstrip('.')}; see `elpd --help`", as_json=as_json)
         sys.exit(2)
     except ElpdError as error:
         report_error(error.kind, str(error), as_json=as_json)
         sys.exit(error.exit_code)
-    except BrokenPipeError:
-        sys.exit(0)
+    except OSError as error:  # a file or folder that is not ours to read or write; devices raise their own
+        where = f"{error.filename}: " if error.filename else ""
+        report_error("UsageError", f"{where}{error.strerror or error}", as_json=as_json)
+        sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

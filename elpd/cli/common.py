@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -13,7 +16,7 @@ from elpd.errors import UsageError
 from elpd.records import Roi
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -45,6 +48,17 @@ def report_error(kind: str, message: str, *, as_json: bool) -> None:
     if as_json:
         print_json({"outcome": None, "error": {"kind": kind, "message": message}})
     print(f"elpd: {message}", file=sys.stderr)
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C into an answer: a cycle asks whether it was cancelled, stops the lens, and ends with a result."""
+    cancelled = threading.Event()
+    previous = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
+    try:
+        yield cancelled.is_set
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def parse_roi(text: str | None) -> Roi | None:

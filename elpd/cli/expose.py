@@ -37,27 +37,28 @@ def command(*, out: Path | None, config_path: Path | None, overrides: tuple[str,
         parts.camera.stop()
     finally:
         rig.release(parts)
-    if image is None:
-        raise UsageError(reason)
-    save(config.journal.directory / "last-map.npz", StoredMap(image, position_um, time.time()))
-    if out is not None:
+    if image is not None and good:
+        save(config.journal.directory / "last-map.npz", StoredMap(image, position_um, time.time()))
+    if image is not None and out is not None:
         write_log_png(out, image.log_intensity)
     geometry = parts.camera.geometry
     fields = {
         "width": geometry.width,
         "height": geometry.height,
-        "fired_fraction": image.fired_fraction,
-        "open_us": int(image.open_us),
-        "hot_pixels": image.hot_pixels,
-        "filled_pixels": image.filled_pixels,
-        "dynamic_range_db": image.dynamic_range_db,
-        "out": None if out is None else str(out),
+        "fired_fraction": None if image is None else image.fired_fraction,
+        "open_us": None if image is None else int(image.open_us),
+        "hot_pixels": None if image is None else image.hot_pixels,
+        "filled_pixels": None if image is None else image.filled_pixels,
+        "dynamic_range_db": None if image is None else image.dynamic_range_db,
+        "out": None if image is None or out is None else str(out),
         "good": good,
         "reason": reason,
         "position_um": position_um,
     }
     if as_json:
         print_json(fields)
+    elif image is None:
+        print(f"no map: {reason}")
     else:
         print(
             f"{geometry.width}x{geometry.height}, {image.fired_fraction:.2%} of the pixels fired, "

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 from typing import Any
 
 import click
 
-from elpd.cli.common import config_options, json_option, parse_roi, print_json
+from elpd.cli.common import config_options, interruptible, json_option, parse_roi, print_json
 from elpd.config import Config, load
 from elpd.errors import BusyError, UsageError
 from elpd.focus.settings import FocusRequest
@@ -50,17 +48,13 @@ def command(
     from elpd.cli.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
     from elpd.cli.view import open_view  # noqa: PLC0415
 
-    cancelled = threading.Event()
-    previous = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
-    try:
+    with interruptible() as cancelled:
         if as_json:
-            session = focus_once(config, request, None, cancelled.is_set)
+            session = focus_once(config, request, None, cancelled)
         else:
             with open_view() as view:
-                session = focus_once(config, request, view, cancelled.is_set)
+                session = focus_once(config, request, view, cancelled)
                 view.result(session.result)
-    finally:
-        signal.signal(signal.SIGINT, previous)
     if as_json:
         print_json(session.fields())
     else:

@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import structlog
+
 from elpd import rig
 from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from elpd.config import Config
+    from elpd.ports import RigParts
     from elpd.records import FocusResult, TemporalImage
 
 
@@ -56,16 +59,28 @@ def focus_once(
     """
     parts = rig.build(config)
     try:
-        if request.reference is not None and request.reference.suffix == ".npz":
-            here_um = parts.lens.position_at(parts.clock.now_ns()).steps * parts.um_per_step
-            depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um
-            stored_map.load(request.reference).check(parts.camera.geometry, here_um, depth_of_focus_um, time.time())
-        with RunWriter.begin(config, request, parts) as run:
-            settings = CycleSettings.from_config(config)
-            cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))
-            result = cycle.run()
-            truth = None if parts.truth is None else parts.truth.errors(result)
-            run.finish(result_fields(result), truth=truth)
-        return Session(result, truth, run.path, cycle.map)
+        return focus_on(parts, config, request, observer, cancelled)
     finally:
         rig.release(parts)
+
+
+def focus_on(
+    parts: RigParts,
+    config: Config,
+    request: FocusRequest,
+    observer: Observer | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Session:
+    """Run one whole cycle on a rig that stays the caller's; raises what ``focus_once`` raises."""
+    if request.reference is not None and request.reference.suffix == ".npz":
+        here_um = parts.lens.position_at(parts.clock.now_ns()).steps * parts.um_per_step
+        depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um
+        stored_map.load(request.reference).check(parts.camera.geometry, here_um, depth_of_focus_um, time.time())
+    with RunWriter.begin(config, request, parts) as run:
+        settings = CycleSettings.from_config(config)
+        cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))
+        result = cycle.run()
+        truth = None if parts.truth is None else parts.truth.errors(result)
+        run.finish(result_fields(result), truth=truth)
+    structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
+    return Session(result, truth, run.path, cycle.map)

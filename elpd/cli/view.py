@@ -14,6 +14,7 @@ import os
 import shutil
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, Self, TextIO
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 REDRAW_S = 1 / 15
 PLOT_ROWS = 12
+SMOOTHED_WINDOWS = 5
 MIN_COLUMNS, MAX_COLUMNS = 40, 110
 
 _ORDER = tuple(phase.value for phase in Phase if phase not in {Phase.IDLE, Phase.DONE})
@@ -89,12 +91,13 @@ class PlainView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stream.flush()
+        with suppress(OSError, ValueError):
+            self._stream.flush()
 
     def phase(self, name: str, /, **fields: Any) -> None:
         """Print the phase's name and what came with it."""
         windows = f"  ({self._windows} windows)" if self._windows and name != Phase.PROBE.value else ""
-        print(f"{name:14s}{_described(fields)}{windows}".rstrip(), file=self._stream, flush=True)
+        self._say(f"{name:14s}{_described(fields)}{windows}".rstrip())
 
     def sample(self, sample: ElpSample, score: float, /) -> None:
         """Count."""
@@ -103,7 +106,11 @@ class PlainView:
 
     def result(self, result: FocusResult, /) -> None:
         """Print the outcome in one line."""
-        print(result_line(result), file=self._stream, flush=True)
+        self._say(result_line(result))
+
+    def _say(self, line: str) -> None:
+        with suppress(OSError, ValueError):  # nobody listens any more: no reason to disturb a cycle
+            print(line, file=self._stream, flush=True)
 
 
 @dataclass(slots=True)
@@ -114,8 +121,16 @@ class Seen:
     fields: dict[str, Any] = field(default_factory=dict)
     positions_um: list[float] = field(default_factory=list)
     times_us: list[int] = field(default_factory=list)
-    scores: list[float] = field(default_factory=list)
+    elps: list[float] = field(default_factory=list)
+    evidence: float = 0.0
     result: FocusResult | None = None
+
+    def take(self, sample: ElpSample, score: float) -> None:
+        """Append one window."""
+        self.times_us.append(sample.begin_us)
+        self.positions_um.append(sample.position_um)
+        self.evidence = score
+        self.elps.append(float(sample.elp))  # last: whoever reads takes as many as there are
 
 
 class LiveView:
@@ -146,10 +161,7 @@ class LiveView:
 
     def sample(self, sample: ElpSample, score: float, /) -> None:
         """Take note; costs three appends."""
-        seen = self._seen
-        seen.times_us.append(sample.begin_us)
-        seen.positions_um.append(sample.position_um)
-        seen.scores.append(score)  # last: whoever reads takes as many as there are scores
+        self._seen.take(sample, score)
         self._news.set()
 
     def result(self, result: FocusResult, /) -> None:
@@ -185,9 +197,9 @@ class LiveView:
 
 def frame(seen: Seen, columns: int, *, colour: bool) -> list[str]:
     """Return the lines of one drawing, *columns* wide and always the same number of them."""
-    count = len(seen.scores)
+    count = len(seen.elps)
     positions = np.array(seen.positions_um[:count], dtype=np.float64)
-    scores = np.array(seen.scores[:count], dtype=np.float64)
+    elps = np.array(seen.elps[:count], dtype=np.float64)
     result = seen.result
     marks: dict[str, float | None] = {"S": None, "●": None, "x": None, "F": None}
     if not np.isfinite(positions).any():  # no lens path is known: the curve runs over time, in ms
@@ -196,17 +208,18 @@ def frame(seen: Seen, columns: int, *, colour: bool) -> list[str]:
     elif count:
         finite = positions[np.isfinite(positions)]
         marks |= {"S": float(finite[0]), "●": float(finite[-1])}
-        marks["x"] = _sign_change(positions, scores)
+        marks["x"] = _sign_change(positions, elps)
     if result is not None:
         marks |= {"●": result.final_um, "F": result.focus_um}
     known = [mark for mark in marks.values() if mark is not None]
     finite = np.concatenate([positions[np.isfinite(positions)], known])
     span = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    legend = "score = ELP in standard deviations    S start  ● lens  x sign change  F focus"
+    evidence = f" (evidence {seen.evidence:+.0f} sigma)" if count and result is None else ""
+    legend = f"ELP, relative{evidence}    S start  ● lens  x sign change  F focus"
     return [
         _phase_line(seen, columns, colour=colour),
         f"{'':{LABEL}s}{legend}"[:columns],
-        *curve(positions, scores, (columns, PLOT_ROWS), span, colour=colour),
+        *curve(positions, _relative(elps), (columns, PLOT_ROWS), span, colour=colour),
         *lens_bar(marks, columns, span),
         _ending(result, columns, colour=colour),
     ]
@@ -252,12 +265,22 @@ def _ending(result: FocusResult | None, columns: int, *, colour: bool) -> str:
     return f"{GREEN if result.outcome is Outcome.FOCUSED else RED}{text}{RESET}"
 
 
-def _sign_change(positions: NDArray[np.float64], scores: NDArray[np.float64]) -> float | None:
-    """Return where the running sum of the score was highest, once it falls: for the eye, not a verdict."""
-    if scores.size < 2:
+def _relative(elps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Smooth over a few windows, for the eye, and divide by the largest: the scene sets the size of ELP."""
+    if elps.size == 0:
+        return elps
+    span = np.ones(min(SMOOTHED_WINDOWS, elps.size))
+    smooth = np.convolve(elps, span, mode="same") / np.convolve(np.ones(elps.size), span, mode="same")
+    largest = float(np.abs(smooth).max())
+    return smooth / largest if largest > 0.0 else smooth
+
+
+def _sign_change(positions: NDArray[np.float64], elps: NDArray[np.float64]) -> float | None:
+    """Return where the running sum of ELP was highest, once it falls: for the eye, not a verdict."""
+    if elps.size < 2:
         return None
-    highest = int(np.argmax(np.cumsum(np.nan_to_num(scores))))
-    return float(positions[highest]) if 0 < highest < scores.size - 1 else None
+    highest = int(np.argmax(np.cumsum(elps)))
+    return float(positions[highest]) if 0 < highest < elps.size - 1 else None
 
 
 def _described(fields: dict[str, Any]) -> str:

@@ -158,7 +158,7 @@ class FocusCycle:
                 self._go_to_declared_place()
             self._stage.interrupt = None
             final_um = self._rest_um()
-        except DeviceError:
+        except BaseException:  # whatever it was, no lens is left running
             self._stop_hard()
             raise
         finally:

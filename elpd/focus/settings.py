@@ -27,7 +27,6 @@ class CycleSettings:
     max_sigma_dof: float = 0.5
     on_failure: Literal["hold", "start", "preset"] = "start"
     preset_um: float | None = None
-    method: Literal["elpd", "paper"] = "elpd"
     transmittance: Literal["profile", "linear", "iris"] = "profile"
 
     @classmethod

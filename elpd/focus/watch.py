@@ -60,6 +60,10 @@ saturation, says which pixels are slow."""
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
 
+FAR_DROP = 0.2
+"""Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
+answers are worth the few micrometres."""
+
 SIGMAS_AFTER_REVERSAL = 9.0
 """A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
 
@@ -214,7 +218,7 @@ class Watch:
                 continue
             self._detector.feed(sample)
             seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if seen and not self._passed and self._memory.peak_passed:
+            if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
@@ -282,13 +286,19 @@ class Watch:
             return None
         memory = self._memory
         ruler = self._ruler(self._begun_us, self.decided_us)
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, memory.refractory_us())
+        deaf = memory.refractory()
+        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
         if said is None:
             return None
-        unmeasured_lag_um = 1e-6 * UNMEASURED_LAG_US * self._settings.speed_um_s
+        speed_um_us = 1e-6 * self._settings.speed_um_s
+        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
-        found = fuse([*self._ask_frames(), *said.witnesses(unmeasured_lag_um, unexplained, width_um)])
+        witnesses = [
+            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
+            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+        ]
+        found = fuse([*self._ask_frames(), *witnesses])
         if found is None:
             return None
         sign = self._sign

@@ -38,6 +38,11 @@ if TYPE_CHECKING:
 _PIECE = 1 << 18
 _RETRY_EVERY = 4
 
+_PATIENCE_US = 60_000
+_RESTLESS = 4.0
+"""In a scene that moves (windows scatter more than twice as widely as still ones), frames are the better witness: they
+are waited for a little longer than the slowest usual frame rate would take."""
+
 _PATIENT_DROP = 0.2
 """Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
 
@@ -171,6 +176,11 @@ class SweepSearch:
         times = self._frames.times_us
         return len(times) >= 3 and now_us - times[-1] <= 2.0 * float(np.median(np.diff(times)))
 
+    def _frames_may_come(self, now_us: int) -> bool:
+        """Whether a camera that has sent one frame or two may yet show that it sends more."""
+        times = self._frames.times_us
+        return 0 < len(times) < 3 and now_us - times[-1] < _PATIENCE_US and self._detector.overdispersion > _RESTLESS
+
     def _attempt(self, now_us: int) -> Detection | None:
         witnesses: list[Witness] = []
         if self._frames_are_coming(now_us):
@@ -181,7 +191,7 @@ class SweepSearch:
                 return None
             spacing = float(np.median(np.abs(np.diff(self._frames.positions))))
             witnesses.append(frame_witness(vertex, spacing))
-        elif not self._image_peak_passed():
+        elif not self._image_peak_passed() or self._frames_may_come(now_us):
             return None
         # An attempt costs many windows' worth of work, so the longer it goes on in vain, the rarer it gets.
         self._attempts += 1

@@ -48,6 +48,9 @@ VERTEX_IN_MOTION = 0.12
 LAG_UNEXPLAINED = 0.5
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
 
+ASTRAY = 0.3
+"""Share of stray pairs at which nothing that was measured on pairs is believed any more."""
+
 UNMEASURED_LAG_US = 1_500.0
 """What a photoreceptor's lag may be when nothing tells: tens of microseconds in sunlight, milliseconds in the dark."""
 
@@ -148,6 +151,8 @@ class EventWitnesses:
             shared = self.lag.typical * float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
         stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
+        # The lag was measured on the pairs: as far as they are astray, it was not.
+        shared = float(np.hypot(shared, min(1.0, stray / ASTRAY) * unmeasured_lag))
         if self.vertex is not None:
             sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
             found.append(Witness("vertex", self.vertex.at, sigma, shared))

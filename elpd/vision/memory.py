@@ -16,7 +16,7 @@ import numpy as np
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.integral import BANDS_PX, band_gain
-from elpd.vision.refractory import refractory_period_us
+from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -37,6 +37,10 @@ FIRST_CAPACITY = 1 << 17
 LEAST_LEVEL = 1.0 / 3.0
 """Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
 event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
+
+LEAST_ORDER = 0.75
+"""Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
+motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
 
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
@@ -66,6 +70,7 @@ class EventMemory:
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
+        self._forgotten = 0
         self.capped = 0
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
@@ -98,16 +103,17 @@ class EventMemory:
         self._columns = columns
         self._count -= drop
         self._taken -= drop
+        self._forgotten += drop
 
     @property
     def _t_us(self) -> NDArray[np.int64]:
         times: NDArray[np.int64] = self._columns[0][: self._count]
         return times
 
-    def refractory_us(self) -> float:
-        """Return how long a pixel is deaf after an event, as far as the events tell (``refractory``); 0 if not."""
+    def refractory(self) -> Refractory:
+        """Return how long a pixel is deaf after an event, as far as the events tell."""
         t_us, x, y, _ = (column[: self._count] for column in self._columns)
-        return refractory_period_us(t_us, x, y, self._shape)
+        return refractory_period(t_us, x, y, self._shape)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
@@ -124,8 +130,18 @@ class EventMemory:
         track = self.track
         if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
             return False
+        if not self._shows_a_picture():
+            return False
         begin_us = track.times_us[track.flank(FLANK)]
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
+
+    def _shows_a_picture(self) -> bool:
+        """Whether the image is sharper, at its peak, than as many events at random would have made it."""
+        track = self.track
+        height, width = self._shape
+        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
+        at_random = band_gain(BANDS_PX[0]) * until / (height * width)
+        return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 
     def ask(
         self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None, deaf_us: float = 0.0

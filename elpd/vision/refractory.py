@@ -7,11 +7,15 @@ half a millisecond at 4 mm/s is 2 um, a third of a depth of focus. Dating events
 sides of focus alike (a pair's halves then lie at equal levels again).
 
 Nobody knows the period of a given sensor and bias; but no two events of one pixel are closer than it, and noise sees to
-it that some nearly are. The fifth shortest interval among ten thousands is the period to a few per cent.
+it that some nearly are. Just above the period the intervals are evenly spread, so the shortest ones, less what their
+number leaves to expect, are the period, and their scatter its error. Where there is hardly any noise the shortest
+interval is set by the steepest edge in view instead; then the intervals above it crowd, and nothing is learnt but a
+bound.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,15 +25,27 @@ from elpd.events.jit import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SHORTEST = 5
+ORDER = 5
 """Which of the shortest intervals is believed: a glitch in the time stamps may make one or two."""
 
+KEPT = 512
 MIN_INTERVALS = 5_000
 MAX_PERIOD_US = 5_000.0
 """Beyond this nobody sets it for focusing, and a shortest interval so long only says that there are few events."""
 
-GRID_SHARE = 0.05
-"""More than this share of all intervals exactly alike, and the time stamps are on a grid: it hides the period."""
+GRID_COUNT = 250
+"""So many intervals exactly alike and shortest, and the time stamps are on a grid: it hides the period."""
+
+CROWDING = 3.0
+"""How many times more intervals in the farther half above the shortest than in the nearer half are a crowd."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refractory:
+    """A refractory period and one standard error, us; both zero where the events say nothing."""
+
+    period_us: float = 0.0
+    sigma_us: float = 0.0
 
 
 @kernel("int64(int64[::1], uint16[::1], uint16[::1], int64[:, ::1], int64[::1])")
@@ -64,10 +80,10 @@ def shortest_intervals(
     return count
 
 
-def refractory_period_us(
+def refractory_period(
     t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], shape: tuple[int, int]
-) -> float:
-    """Return the refractory period in us, 0 where the events do not tell it.
+) -> Refractory:
+    """Return the refractory period, as far as the events tell it.
 
     Parameters
     ----------
@@ -76,8 +92,16 @@ def refractory_period_us(
 
     """
     last_us = np.full(shape, -1, np.int64)
-    shortest_us = np.full(max(SHORTEST, round(GRID_SHARE * MIN_INTERVALS)), np.iinfo(np.int64).max)
+    shortest_us = np.full(KEPT, np.iinfo(np.int64).max)
     count = shortest_intervals(t_us, x, y, last_us, shortest_us)
-    if count < MIN_INTERVALS or shortest_us[SHORTEST - 1] > MAX_PERIOD_US or shortest_us[0] == shortest_us[-1]:
-        return 0.0
-    return float(shortest_us[SHORTEST - 1])
+    least_us = float(shortest_us[ORDER - 1])
+    if count < MIN_INTERVALS or least_us > MAX_PERIOD_US or shortest_us[0] == shortest_us[GRID_COUNT]:
+        return Refractory()
+    top_us = min(1.5 * least_us, float(shortest_us[-1]))
+    if top_us <= least_us:
+        return Refractory()
+    first, second = np.diff(np.searchsorted(shortest_us, [least_us, 0.5 * (least_us + top_us), top_us]))
+    if first + second == 0 or second > CROWDING * (first + 2):
+        return Refractory(0.0, 0.5 * least_us)
+    per_us = float(first + second) / (top_us - least_us)
+    return Refractory(max(0.0, least_us - ORDER / per_us), min(0.5 * least_us, float(np.sqrt(ORDER)) / per_us))

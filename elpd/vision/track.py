@@ -6,6 +6,7 @@ drawn from frames (the sharpest witness where there are any) and from the image 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -116,7 +117,13 @@ class PeakTrack:
         wide = fit_vertex(z, y, float(np.ptp(z)))
         if wide is None:
             return None
-        return fit_vertex(z, y, wide.width * np.sqrt(2.0 * FIT_DROP)) or wide
+        reach = wide.width * float(np.sqrt(2.0 * FIT_DROP))
+        vertex = fit_vertex(z, y, reach) or wide
+        narrow = fit_vertex(z, y, 0.7 * reach)
+        # Points of one curve share what motion does to them; how the answer moves with the window tells more than
+        # their scatter.
+        moved = 0.0 if narrow is None else abs(narrow.at - vertex.at)
+        return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))
 
 
 class FrameEnergy:

@@ -19,7 +19,7 @@ from elpd_drivers.lenses.serial_port import SerialPort
 from lens_rigs import KINDS, SPEED_SPS, served
 from virtual import MonotonicClock
 
-from elpd.errors import ConfigError, LensError
+from elpd.errors import BusyError, ConfigError, LensError
 from elpd.records import LensFlag, StopMode
 from elpd.units import HostNs, Steps, after_ms
 
@@ -89,7 +89,7 @@ def test_a_lens_over_a_pty_homes(kind: str, board: Any) -> None:
 def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(kind: str, board: Any) -> None:
     server, motor = board
     lens = open_lens(kind, server.port)
-    with pytest.raises(LensError, match="in use by another program"):
+    with pytest.raises(BusyError, match="in use by another program"):
         open_lens(kind, server.port)
     assert motor.rotor_at(CLOCK.now_ns()) == 3200.0
     lens.close()

@@ -332,3 +332,20 @@ def test_given_sweeps_without_a_focus_have_none(name: Any, frames: Any) -> None:
     assert found.outcome is not Outcome.FOCUSED
     if frames is None and name[0] in "ab":
         assert found.direction is Direction.RECEDING
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("shake_px", [0.1, 0.6])
+def test_a_shaken_scene_is_answered_within_two_depths_of_focus_or_not_at_all(seed: Any, shake_px: Any) -> None:
+    world = sweep(seed=seed, size=SIZE, end_um=90.0, shake_px=shake_px)
+    found = searched(world, reference=start_picture(seed, -150.0))
+    assert found.outcome is not Outcome.FOCUSED or abs(error_um(found, world)) < 2.0 * DOF_UM
+
+
+def test_in_a_shaken_scene_frames_are_waited_for() -> None:
+    world = sweep(seed=1, size=SIZE, end_um=90.0, shake_px=0.1, frame_every_us=3_000)
+    found = searched(world)
+    assert found.outcome is Outcome.FOCUSED
+    assert found.focus is not None
+    assert found.focus.contributions[0][0] == "frames"
+    assert abs(error_um(found, world)) < 2.0 * DOF_UM

@@ -1,5 +1,6 @@
 """Windows: exact sums for any cut, ends by time, travel and events, and nothing decided by a recording's end."""
 
+from dataclasses import replace
 from typing import Any
 
 import naive_vision
@@ -12,7 +13,7 @@ from elpd.errors import UsageError
 from elpd.records import Roi
 from elpd.vision.filters import PixelCap
 from elpd.vision.meter import Meter, WindowsByEvents, WindowsByTime, WindowsByTravel, sum_windows
-from elpd.vision.reference import Reference
+from elpd.vision.reference import reference_from_frame
 from elpd.vision.ruler import Ruler
 
 ROI = Roi(1, 1, 4, 3)
@@ -20,7 +21,7 @@ WEIGHTS = np.random.default_rng(1).integers(-2000, 2000, (6, 7)).astype(np.int16
 
 
 def reference() -> Any:
-    return Reference(WEIGHTS, 100.0, 1.0, np.ones(WEIGHTS.shape, np.float32), WEIGHTS)
+    return replace(reference_from_frame(np.zeros(WEIGHTS.shape, np.uint8), ROI), weights=WEIGHTS)
 
 
 @st.composite

@@ -25,8 +25,8 @@ class Terminal(io.StringIO):
         return True
 
 
-def sample(position_um: float, begin_us: int = 0) -> ElpSample:
-    return ElpSample(begin_us, begin_us + 1000, elp=1, energy=1, n_on=1, n_off=1, position_um=position_um)
+def sample(position_um: float, begin_us: int = 0, elp: int = 1) -> ElpSample:
+    return ElpSample(begin_us, begin_us + 1000, elp=elp, energy=1, n_on=1, n_off=1, position_um=position_um)
 
 
 def focused(**changes: object) -> FocusResult:
@@ -52,7 +52,7 @@ def watch_a_sweep(view: LiveView | PlainView) -> None:
         view.phase("expose")
         view.phase("sweep", sign=1, position_um=12.3456)
         for step in range(100):
-            view.sample(sample(float(step), 1000 * step), 60.0 - step)
+            view.sample(sample(float(step), 1000 * step, 60 - step), 6.0)
         view.phase("done")
         view.result(focused())
 
@@ -137,7 +137,7 @@ def test_a_terminal_that_takes_nothing_does_not_hold_the_cycle(monkeypatch: pyte
     view.__enter__()
     for step in range(1000):
         view.sample(sample(float(step)), 1.0)
-    assert len(view._seen.scores) == 1000
+    assert len(view._seen.elps) == 1000
     resume.set()
     view.__exit__()
 
@@ -149,7 +149,7 @@ def test_a_drawing_has_always_the_same_height_and_fits(columns: int, count: int)
     for step in range(count):
         seen.times_us.append(1000 * step)
         seen.positions_um.append(5.0 + step)
-        seen.scores.append(150.0 - step)
+        seen.elps.append(150.0 - step)
     for result in (None, focused(), focused(final_um=None, focus_um=None, outcome=Outcome.NO_CROSSING)):
         seen.result = result
         lines = frame(seen, columns, colour=False)
@@ -163,7 +163,7 @@ def test_the_drawing_marks_start_crossing_and_focus() -> None:
     for step in range(100):
         seen.times_us.append(1000 * step)
         seen.positions_um.append(float(step))
-        seen.scores.append(50.5 - step)
+        seen.elps.append(50.5 - step)
     bar = frame(seen, LABEL + 100, colour=False)[-3]
     assert (bar.index("S"), bar.index("x"), bar.index("●")) == (LABEL, LABEL + 50, LABEL + 99)
     seen.result = focused(focus_um=20.0, final_um=20.0)
@@ -171,7 +171,7 @@ def test_the_drawing_marks_start_crossing_and_focus() -> None:
 
 
 def test_without_a_lens_path_the_curve_runs_over_time() -> None:
-    seen = Seen(times_us=[0, 1000, 2000], positions_um=[float("nan")] * 3, scores=[1.0, 0.0, -1.0])
+    seen = Seen(times_us=[0, 1000, 2000], positions_um=[float("nan")] * 3, elps=[1.0, 0.0, -1.0])
     lines = frame(seen, 60, colour=False)
     assert any(chr(0x2800) < letter <= chr(0x28FF) for letter in "".join(lines))
 

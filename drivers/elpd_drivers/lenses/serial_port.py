@@ -17,7 +17,7 @@ from contextlib import suppress
 
 import serial
 
-from elpd.errors import ConfigError, LensError
+from elpd.errors import BusyError, ConfigError, ElpdError, LensError
 
 WRITE_TIMEOUT_S = 0.05
 
@@ -34,8 +34,10 @@ class SerialPort:
 
     Raises
     ------
+    BusyError
+        If another program holds the port.
     LensError
-        If the port is missing, in use, or may not be opened.
+        If the port is missing or may not be opened.
     """
 
     def __init__(self, path: str, baud: int) -> None:
@@ -45,7 +47,7 @@ class SerialPort:
         try:
             self._serial = serial.Serial(path, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
         except (serial.SerialException, OSError) as error:
-            raise LensError(_why_not(path, error)) from None
+            raise _why_not(path, error) from None
         self._descriptor: int | None = self._serial.fileno()
         with suppress(OSError):
             fcntl.ioctl(self._descriptor, termios.TIOCEXCL)
@@ -131,15 +133,17 @@ class SerialPort:
         return True
 
 
-def _why_not(path: str, error: Exception) -> str:
+def _why_not(path: str, error: Exception) -> ElpdError:
     """Turn the ways in which opening fails into what a person can do."""
     code = getattr(error, "errno", None)
     if code is None and "exclusively lock" in str(error):
         code = errno.EAGAIN
     if code in {errno.EAGAIN, errno.EBUSY}:
-        return f"lens port {path}: it is in use by another program; close that first (`fuser {path}` names it)"
+        return BusyError(
+            f"lens port {path}: it is in use by another program; close that first (`fuser {path}` names it)"
+        )
     if code == errno.ENOENT or not os.path.exists(path):  # noqa: PTH110  (a string from a config, not a path of ours)
-        return f"lens port {path}: there is no such port; plug the controller in, or correct lens.port"
+        return LensError(f"lens port {path}: there is no such port; plug the controller in, or correct lens.port")
     if code == errno.EACCES:
-        return f"lens port {path}: permission denied; add this user to the port's group (often `dialout`)"
-    return f"lens port {path}: cannot be opened as a serial port ({error}); correct lens.port"
+        return LensError(f"lens port {path}: permission denied; add this user to the port's group (often `dialout`)")
+    return LensError(f"lens port {path}: cannot be opened as a serial port ({error}); correct lens.port")

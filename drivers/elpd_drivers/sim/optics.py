@@ -217,6 +217,13 @@ class LightField:
         shifts = [self._motion.displacement_px(int(t) / 1e3) for t in times_ns]
         return [Condition(float(s), *d, float(q)) for s, d, q in zip(sigma2, shifts, light, strict=True)]
 
+    def wide_open(self, when_ns: int) -> Condition:
+        """Return what holds at an instant behind a fully open aperture, under a lamp that does not flicker."""
+        carriage_um = self._carriage_um(np.array([when_ns], np.int64))[0]
+        sigma2_px2 = SIGMA0_PX**2 + (self._px_per_um * (carriage_um - self._focus_um)) ** 2
+        shift_x_px, shift_y_px = self._motion.displacement_px(when_ns / 1e3)
+        return Condition(float(sigma2_px2), shift_x_px, shift_y_px, 0.0 if self._cap else 1.0)
+
     def steps_needed(self, conditions: list[Condition]) -> int:
         """Say into how many pieces the time spanned by *conditions* must be cut for the picture to change evenly."""
         lights = [condition.light for condition in conditions]

@@ -19,7 +19,7 @@ import numpy as np
 from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
-from elpd.records import Encoding, Geometry
+from elpd.records import Encoding, Geometry, Roi
 from elpd_drivers.lenses import grbl, tic
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
@@ -140,6 +140,8 @@ class SimulatedTruth:
         aperture: SimulatedAperture | None,
         focus_carriage_um: float,
         scene: str,
+        light: LightField,
+        geometry: Geometry,
     ) -> None:
         self.world = world
         self.mechanism = mechanism
@@ -148,6 +150,15 @@ class SimulatedTruth:
         self.focus_carriage_um = focus_carriage_um
         self.scene = scene
         self._lens = lens
+        self._light = light
+        self._geometry = geometry
+
+    def picture(self) -> NDArray[np.float32]:
+        """Return what falls on the sensor now, behind an open aperture: log photocurrent, (height, width)."""
+        whole = Roi(0, 0, self._geometry.width, self._geometry.height)
+        out = np.empty((whole.height, whole.width), np.float32)
+        self._light.render(self._light.wide_open(self.world.now_ns()), whole, out)
+        return out
 
     def carriage_error_um(self) -> float:
         """Return how far the carriage is from focus now, signed."""
@@ -218,6 +229,8 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         aperture=aperture,
         focus_carriage_um=focus_um,
         scene=scene,
+        light=light,
+        geometry=geometry,
     )
     return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, chosen.um_per_step, truth)
 
