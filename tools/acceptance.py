@@ -80,7 +80,9 @@ def focus(config: Config, case: tuple[int, float]) -> dict[str, Any]:
     try:
         result = FocusCycle(parts, CycleSettings.from_config(config), FocusRequest(), sweeps).run()
         row |= result_fields(result)
-        row |= {} if parts.truth is None else parts.truth.errors(result)
+        truth = {} if parts.truth is None else parts.truth.errors(result)
+        row["true_focus_um"] = truth.pop("focus_um", None)
+        row |= truth
     except ElpdError as error:
         row |= {"outcome": error.kind, "reason": str(error)}
     finally:
