@@ -104,7 +104,7 @@ class Story:
     def moved(self) -> bool:
         """Whether the lens was ever asked to move, or did."""
         asked = any(command.name in {"run", "move_to", "home"} for command in self.commands)
-        return asked or bool(np.ptp(self.truth.mechanism.motor_steps(self._history_ns())))
+        return asked or bool(np.ptp(self.truth.mechanism.motor_steps(self.history_ns())))
 
     def stopped_after_ms(self, when_ns: int) -> float:
         """Return how long after an instant the next stop was sent."""
@@ -112,7 +112,8 @@ class Story:
         assert later, "no stop was sent"
         return (later[0] - when_ns) / NS_PER_MS
 
-    def _history_ns(self) -> np.ndarray:
+    def history_ns(self) -> np.ndarray:
+        """Every tenth of a millisecond from the world's birth to now."""
         return np.arange(BIRTH_NS, self.parts.clock.now_ns(), HISTORY_STEP_NS)
 
 
@@ -184,7 +185,7 @@ def _one_ending(story: Story) -> None:
 
 
 def _limits_held(story: Story) -> None:
-    times = story._history_ns()
+    times = story.history_ns()
     limits, mechanism = story.parts.lens.limits, story.truth.mechanism
     asked = mechanism.motor_steps(times)
     assert asked.min() >= limits.min_steps - 1, "the motor was sent below its limits"

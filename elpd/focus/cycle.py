@@ -274,11 +274,11 @@ class FocusCycle:
             turn_s += REJOG_S
         slow = braking_um > 5 * self._settings.depth_of_focus_um
         self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
-        self._stage.listener = self._stage.interrupt = None  # the sweep asks for itself, and stops the lens first
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
         turned_at_um: float | None = None
+        lit, dark = False, True
         while True:
             self._details["sweep_sign"] = sign
             plan = SweepPlan(
@@ -291,8 +291,10 @@ class FocusCycle:
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
                 turned_at_um=turned_at_um,
+                lit=lit,
             )
             self._phase(Phase.SWEEP, sign=sign, position_um=self._here_um())
+            self._stage.listener = self._stage.interrupt = None  # the sweep asks for itself, and stops the lens first
             report = sweep.run(plan)
             self._sink.note(
                 "sweep",
@@ -308,13 +310,17 @@ class FocusCycle:
                 return report
             if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
                 if report.verdict.outcome is Outcome.TOO_FEW_EVENTS and self._in_the_light(watch):
+                    lit, reach_um = True, reach_um - abs(self._here_um() - report.begun_um)
+                    continue  # far from focus a lens may go a long way before anything changes
+                raise self._rule(report.verdict)
+            dark = dark and report.end is SweepEnd.RULE and report.dark
+            if self._reversals >= self._settings.max_reversals:
+                if lit and dark:
                     raise _Ended(
                         Outcome.LENS_DID_NOT_MOVE,
                         "nothing changed while the lens should have moved, and yet the scene is in the light: the "
                         "aperture shows it; check the coupling, and that the motor turns",
                     )
-                raise self._rule(report.verdict)
-            if self._reversals >= self._settings.max_reversals:
                 if report.end is SweepEnd.RULE:
                     raise self._rule(report.verdict)
                 raise _Ended(

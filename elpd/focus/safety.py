@@ -69,6 +69,10 @@ class Conditions:
     """Events inside the ROI since this sweep direction began."""
     resting_events: float = 0.0
     """Events that noise alone would have made in the same time."""
+    resting_counted: float = float("inf")
+    """How many events that was learnt from."""
+    lit: bool = False
+    """Whether it is known that the scene is in the light: few events mean a lens far from focus, or stuck."""
     lost_fraction: float = 0.0
     """Share of events lost since the cycle began."""
 
@@ -85,6 +89,13 @@ class Verdict:
 def decide(now: Conditions) -> Verdict:
     """Return the verdict of highest precedence (pure)."""
     return max(_verdicts(now), key=lambda verdict: verdict.action, default=Verdict(Action.CONTINUE))
+
+
+def is_dark(now: Conditions) -> bool:
+    """Say whether the events of this direction do not stand above noise (pure)."""
+    noise = now.resting_events
+    variance = noise + noise * noise / max(1.0, now.resting_counted)
+    return now.events < noise + DARK_EVENTS + DARK_SIGMAS * sqrt(variance)
 
 
 def _verdicts(now: Conditions) -> Iterator[Verdict]:
@@ -117,8 +128,7 @@ def _verdicts(now: Conditions) -> Iterator[Verdict]:
             "check that the motor is energised and free",
         )
     dark_um = DARK_TRAVEL_DOF * now.depth_of_focus_um
-    noise = now.resting_events + DARK_EVENTS + DARK_SIGMAS * sqrt(now.resting_events)
-    if now.travel_um > dark_um and now.events < noise and now.camera_silent_ms < HEARD_MS:
+    if now.travel_um > dark_um and not now.lit and is_dark(now) and now.camera_silent_ms < HEARD_MS:
         yield Verdict(
             Action.GIVE_UP,
             Outcome.TOO_FEW_EVENTS,

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from elpd.focus.stage import Stage
     from elpd.focus.watch import Watch
     from elpd.records import CommandStamp, ElpSample
-    from elpd.units import SensorUs
 
 READ_TIMEOUT_S = 0.001
 
@@ -49,6 +48,8 @@ class SweepPlan:
     stop_mode: StopMode
     turned_at_um: float | None = None
     """Where the reversal that led to this direction was commanded; ``None`` if there was none."""
+    lit: bool = False
+    """Whether it is known that the scene is in the light."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,8 @@ class SweepReport:
     verdict: safety.Verdict
     stop: CommandStamp | None
     begun_um: float
-    ended_us: SensorUs | None
+    dark: bool = False
+    """Whether nothing stood above noise when a rule ended it."""
 
 
 class Sweep:
@@ -97,14 +99,15 @@ class Sweep:
                 if watch.passed:
                     stop = lens.stop(plan.stop_mode)
                     self._show(samples)
-                    return SweepReport(SweepEnd.PASSED, safety.Verdict(safety.Action.CONTINUE), stop, begun_um, None)
+                    return SweepReport(SweepEnd.PASSED, safety.Verdict(safety.Action.CONTINUE), stop, begun_um)
                 self._show(samples)
                 if watch.direction is Direction.RECEDING:
-                    return SweepReport(SweepEnd.BEHIND, safety.Verdict(safety.Action.CONTINUE), None, begun_um, None)
-            verdict = safety.decide(self._conditions(plan, begun_ns, begun_um, heard_ns, reported_from))
+                    return SweepReport(SweepEnd.BEHIND, safety.Verdict(safety.Action.CONTINUE), None, begun_um)
+            conditions = self._conditions(plan, begun_ns, begun_um, heard_ns, reported_from)
+            verdict = safety.decide(conditions)
             if verdict.action is not safety.Action.CONTINUE:
                 stop = lens.stop(StopMode.ABRUPT if verdict.action is safety.Action.FAULT else plan.stop_mode)
-                return SweepReport(SweepEnd.RULE, verdict, stop, begun_um, None)
+                return SweepReport(SweepEnd.RULE, verdict, stop, begun_um, dark=safety.is_dark(conditions))
 
     def _conditions(
         self, plan: SweepPlan, begun_ns: HostNs, begun_um: float, heard_ns: HostNs, reported_from: object
@@ -131,6 +134,8 @@ class Sweep:
             depth_of_focus_um=plan.depth_of_focus_um,
             events=self._watch.events,
             resting_events=self._watch.resting_rate_hz * (now - begun_ns) / 1e9,
+            resting_counted=self._watch.resting_events,
+            lit=plan.lit,
             lost_fraction=stage.lost_events / max(1, stage.lost_events + self._watch.events_in_cycle),
         )
 

@@ -26,7 +26,7 @@ from elpd.vision.crossing import (
     frame_witness,
     fuse,
 )
-from elpd.vision.detector import SIGMAS, Detector, RestingRate
+from elpd.vision.detector import Detector, RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
@@ -56,10 +56,12 @@ LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
 
-
 FAR_DROP = 0.2
 """Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
 answers are worth the few micrometres."""
+
+SIGMAS_OF_PROBE = 5.0
+"""What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
 
 SIGMAS_AFTER_REVERSAL = 9.0
 """A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
@@ -168,6 +170,11 @@ class Watch:
         """Events per second that the region sends at rest."""
         return 1e6 * self._rest.events_per_us
 
+    @property
+    def resting_events(self) -> int:
+        """How many events the resting rate was learnt from."""
+        return self._rest_sums[1]
+
     def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
         """Begin a direction of travel: everything is judged afresh.
 
@@ -180,7 +187,9 @@ class Watch:
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
-        self._detector = Detector(self._rest, recede_sigmas=SIGMAS if turned_at_um is None else SIGMAS_AFTER_REVERSAL)
+        self._detector = Detector(
+            self._rest, recede_sigmas=SIGMAS_OF_PROBE if turned_at_um is None else SIGMAS_AFTER_REVERSAL
+        )
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us

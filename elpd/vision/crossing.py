@@ -38,7 +38,7 @@ WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
 SYSTEMATIC_FRAMES = 0.012
-SYSTEMATIC_VERTEX = 0.06
+SYSTEMATIC_VERTEX = 0.08
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 

@@ -1,0 +1,250 @@
+"""Everything that is measured, behind one call: a recording in, a row of numbers out.
+
+The peers come from ``elpd.baselines``; ``elpd`` is our own causal detector through the Python API that ``elpd detect``
+uses. Each is run at the frame rates that concern it: what needs no frames is run once. Processor time is that of the
+method alone, without making or loading the case; times and lengths are signed so that late and beyond focus are
+positive.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.sets import APERTURE_US, MAP
+from elpd.baselines import PEERS, StackFrame
+from elpd.record.layouts import RecordedSweep
+from elpd.record.sweep_file import SweepSearch
+from elpd.records import Outcome
+from elpd.units import SensorUs
+from elpd.vision.first_events import FirstEventMap
+from elpd.vision.pictures import display
+from elpd.vision.reference import reference_from_temporal_image
+from elpd.vision.ruler import Ruler
+from elpd.vision.temporal_map import read_transmittance, temporal_image
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from benchmarks.cases import SweepRecording
+    from elpd.records import TemporalImage
+
+OURS = "elpd"
+NO_FRAMES = "-"
+"""The frame rate of a method that sees events only."""
+_AHEAD = 0.35
+"""Where in the sweep the released "1 fps" program takes its one frame: a frame from the future."""
+_CURVES_OF = (("elp-syn", "50"), ("elp-syn-1fps", "1"))
+"""Only these curves are kept; the report draws some of them, and all would make the results ten times larger."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A name, a title for tables, what it is allowed to see, and the frame rates it is run at."""
+
+    name: str
+    title: str
+    sees: str
+    rates: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One method on one case. ``None`` where there is no answer.
+
+    ``error_um`` is estimate less truth, ``sharpest_um`` where the picture itself is sharpest, on the same ruler,
+    ``decided_um`` how far past focus the lens was when the answer could be given, ``focusing_ms`` the time from the
+    start of the sweep until the lens could be back at the estimate, without braking.
+    """
+
+    case: str
+    set_name: str
+    scene: str
+    fov: int
+    motion: str
+    method: str
+    rate: str
+    events: int
+    error_um: float | None
+    sigma_um: float | None
+    decided_um: float | None
+    focusing_ms: float | None
+    sharpest_um: float
+    cpu_ms: float
+    reason: str
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as plain data."""
+        return asdict(self)
+
+
+def all_methods() -> dict[str, Method]:
+    """Return every method by name, ours first."""
+    methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, NO_FRAMES))}
+    for name, peer in PEERS.items():
+        if not peer.needs_frames:
+            rates: tuple[str, ...] = (NO_FRAMES,)
+        elif name == "elp-syn-1fps":
+            rates = ("1",)
+        else:
+            # One frame has no contrast to compare with, and the released programs at 1 fps are the method above.
+            rates = ("50", "20", MAP) if name == "elp-evk4" else ("50", "20")
+        methods[name] = Method(name, peer.title, peer.sees, rates)
+    return methods
+
+
+def run_method(method: Method, rate: str, recording: SweepRecording) -> Row:
+    """Run *method* on *recording* with frames at *rate*."""
+    picture = aperture_picture(recording) if rate == MAP else None
+    if picture is not None:
+        grey = display(picture.log_intensity, picture.valid)
+        frames: tuple[StackFrame, ...] = (StackFrame(recording.case.of_set.sweep_begin_us, grey),)
+    else:
+        frames = () if rate == NO_FRAMES else recording.frames_at(rate)
+    if method.name == OURS:
+        return _run_ours(recording, rate, () if picture is not None else frames, picture)
+    if method.name == "elp-syn-1fps":
+        chosen = recording.case.of_set
+        ahead_us = chosen.sweep_begin_us + _AHEAD * (chosen.end_us - chosen.sweep_begin_us)
+        frames = (recording.frame_nearest(ahead_us),)
+    stack = recording.stack(frames)
+    started = time.process_time()
+    answer = PEERS[method.name].run(stack)
+    cpu_ms = 1e3 * (time.process_time() - started)
+    details = dict(answer.details)
+    curve = details.pop("curve", None)
+    if curve is not None and (method.name, rate) in _CURVES_OF:
+        details["curve"] = {"t_us": curve["t_us"], "elp": [round(value, 3) for value in curve["elp"]]}
+    return _row(
+        recording,
+        method.name,
+        rate,
+        focus_us=answer.focus_us,
+        sigma_us=math.nan,
+        decided_us=answer.decided_us,
+        cpu_ms=cpu_ms,
+        reason=str(details.pop("reason", "")),
+        details=details,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _HeldFrame:
+    """A frame in memory, where the detector expects one on disk."""
+
+    t_us: int
+    pixels: NDArray[np.uint8]
+
+    def load(self) -> NDArray[np.uint8]:
+        return self.pixels
+
+
+def aperture_picture(recording: SweepRecording) -> TemporalImage:
+    """Return the picture that the events of the opening aperture give."""
+    first = FirstEventMap(recording.geometry, 0, APERTURE_US)
+    stop = int(np.searchsorted(recording.t_us, APERTURE_US))
+    first.add(recording.t_us[:stop], recording.x[:stop], recording.y[:stop], recording.on[:stop])
+    return temporal_image(first.believed(), read_transmittance("linear"), SensorUs(0))
+
+
+def _run_ours(
+    recording: SweepRecording, rate: str, frames: tuple[StackFrame, ...], picture: TemporalImage | None
+) -> Row:
+    held = tuple(_HeldFrame(frame.t_us, frame.pixels) for frame in frames)
+    sweep = RecordedSweep(
+        recording.t_us,
+        recording.x,
+        recording.y,
+        recording.on,
+        recording.geometry,
+        recording.roi,
+        held,  # type: ignore[arg-type]  # same shape as FrameFile: t_us and load()
+    )
+    started = time.process_time()
+    chosen = recording.case.of_set
+    path = recording.path()
+    search = SweepSearch(
+        sweep,
+        recording.roi,
+        Ruler.of_path(path.t_us, path.position_um),
+        depth_of_focus_um=chosen.depth_of_focus_um,
+        begin_us=chosen.sweep_begin_us,
+        reference=None if picture is None else reference_from_temporal_image(picture, recording.roi),
+    )
+    found = search.run()
+    cpu_ms = 1e3 * (time.process_time() - started)
+    focused = found.outcome is Outcome.FOCUSED
+    contributions = found.focus.contributions if found.focus is not None else ()
+    return _row(
+        recording,
+        OURS,
+        rate,
+        focus_us=_number(found.focus_us if focused else None),
+        sigma_us=_number(found.sigma_us if focused else None),
+        decided_us=_number(found.decided_us if focused else None),
+        cpu_ms=cpu_ms,
+        reason="" if focused else f"{found.outcome.value}: {found.reason}",
+        details={
+            "direction": found.direction.value,
+            "contributions": [
+                {"name": name, "at_um": at_um, "sigma_um": sigma_um, "weight": weight}
+                for name, at_um, sigma_um, weight in contributions
+            ],
+        },
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _row(
+    recording: SweepRecording,
+    method: str,
+    rate: str,
+    *,
+    focus_us: float,
+    sigma_us: float,
+    decided_us: float,
+    cpu_ms: float,
+    reason: str,
+    details: dict[str, Any],
+) -> Row:
+    case = recording.case
+    chosen = case.of_set
+    focusing_ms = math.nan
+    if math.isfinite(focus_us):
+        # A decision after the sweep is taken where the sweep ended; the way back is driven at the sweep's speed.
+        there_us = min(decided_us, chosen.end_us)
+        focusing_ms = (decided_us - chosen.sweep_begin_us + abs(there_us - focus_us)) / 1e3
+        if decided_us >= chosen.end_us:
+            focusing_ms += cpu_ms
+        if "search_us" in details:
+            focusing_ms = details["search_us"] / 1e3
+    return Row(
+        case=case.name,
+        set_name=case.set_name,
+        scene=case.scene,
+        fov=case.fov,
+        motion=case.motion,
+        method=method,
+        rate=rate,
+        events=int(recording.t_us.size),
+        error_um=_or_none((focus_us - recording.truth_us) * chosen.um_per_us),
+        sigma_um=_or_none(sigma_us * chosen.um_per_us),
+        decided_um=_or_none((decided_us - recording.truth_us) * chosen.um_per_us) if math.isfinite(focus_us) else None,
+        sharpest_um=round(recording.sharpest_um, 4),
+        focusing_ms=_or_none(focusing_ms),
+        cpu_ms=round(cpu_ms, 3),
+        reason=reason,
+        details=details,
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None

@@ -1,0 +1,270 @@
+"""The report: one HTML file that holds its tables, plots and words, and refers to nothing.
+
+It says first what the numbers are and are not: which methods saw the future, which were allowed a tuned offset, and
+what a mean leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.methods import OURS, all_methods
+from benchmarks.plots import Plot, Series, draw
+from benchmarks.sets import MAP, SETS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from benchmarks.methods import Row
+    from benchmarks.scoring import Score
+    from benchmarks.sets import CaseSet
+
+PLOTTED = (
+    (OURS, "50"),
+    (OURS, "1"),
+    (OURS, MAP),
+    (OURS, "-"),
+    ("elp-syn", "50"),
+    ("elp-syn-1fps", "1"),
+    ("pbf", "-"),
+    ("egs", "-"),
+    ("esva", "-"),
+)
+"""What error distributions show; no set has more than eight of them, which can still be told apart."""
+
+COLUMNS = {
+    "cases": "cases",
+    "MAE um": "mae_um",
+    "bias": "bias_um",
+    "worst": "worst_um",
+    "to sharpest": "to_sharpest_um",
+    "missed": "missed",
+    "outside": "outside",
+    "early": "early",
+    "wrong way": "wrong_way",
+    "decided um": "decided_um",
+    "to focus ms": "focusing_ms",
+    "CPU ms": "cpu_ms",
+    "rms err/σ": "spread",
+    "paper MAE": "published_um",
+    "rerun MAE": "rerun_um",
+}
+COUNTS_OF_TROUBLE = ("missed", "outside", "early", "wrong_way")
+SIGNED = ("bias_um", "decided_um")
+BAD = " class='bad'"
+
+WORST_DRAWN_UM = 400.0
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; color: #111 }
+table { border-collapse: collapse; margin: .6rem 0 1.6rem; font-size: 13px; font-variant-numeric: tabular-nums }
+th, td { border-bottom: 1px solid #ddd; padding: .2rem .55rem; text-align: right; white-space: nowrap }
+th { background: #f4f4f4; position: sticky; top: 0 } td.word, th.word { text-align: left }
+tr.ours td { background: #eef6ff } td.bad { color: #b00020; font-weight: 600 }
+.plots { display: flex; flex-wrap: wrap; gap: 1rem } .scroll { overflow-x: auto }
+svg text { font-family: system-ui, sans-serif; font-size: 13px } svg .small { font-size: 11px; fill: #333 }
+svg .title { font-weight: 600 } svg .frame { fill: none; stroke: #888 } svg .grid { stroke: #e8e8e8 }
+svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; font-weight: 600; margin: .8rem 0 }
+"""
+
+WORDS = """
+<p>One sweep per case; truth is the plane of least RMS spot radius. <b>Error</b> is estimate less truth. A mean over
+answered cases says nothing about the others: <b>missed</b> counts cases without an answer, <b>outside</b> answers
+more than one depth of focus off, <b>early</b> decisions more than that before focus, <b>wrong way</b> those that
+took the approach for receding. Where there is nothing to focus on, every answer is outside. <b>Decided</b> is how
+far past focus the lens was when the answer could first be given as it stands, the median: a method that looks at
+the whole stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the
+start of the sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE
+against the place where the noise-free picture has its highest contrast: off the axis it is not where the spot is
+smallest, and a method that looks at pictures can hardly do better than their distance. <b>CPU</b> is the median
+processor time of the method for the whole sweep, in this implementation.</p>
+<p><b>Paper</b> is the paper's MAE on its own 84 cases, for ELP an estimate made in hindsight with a built-in
+offset; <b>rerun</b> what a later paper's authors found when they ran it. The cases here follow the paper's text;
+its pictures, lens and noise are not public, so the columns stand beside each other and are not the same
+measurement.</p>
+"""
+
+
+def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settings: dict[str, Any]) -> None:
+    """Write the report to *path*."""
+    told = ", ".join(
+        f"{key} {value if not isinstance(value, list) else ' '.join(value)}" for key, value in settings.items()
+    )
+    body = [f"<h1>Autofocus benchmark</h1><p>{escape(told)}</p>", WORDS]
+    for set_name in dict.fromkeys(score.set_name for score in table):
+        chosen = SETS[set_name]
+        body.append(f"<h2>{escape(set_name)}: {escape(chosen.about)}</h2><p>{_setting(chosen)}</p>")
+        own_rows = [row for row in rows if row.set_name == set_name]
+        own_scores = [score for score in table if score.set_name == set_name]
+        motions = list(dict.fromkeys(score.motion for score in own_scores))
+        body.append(_overview(own_scores, motions))
+        for motion in motions:
+            body.append(f"<h3>{escape(motion)}</h3>")
+            body.append(_score_table([score for score in own_scores if score.motion == motion]))
+        body.append("<h3>How errors are distributed</h3><div class='plots'>")
+        body.extend(_errors([row for row in own_rows if row.motion == motion], motion) for motion in motions)
+        body.append(_calibration(own_rows))
+        body.append("</div><h3>ELP as published, filtered, over the sweep</h3><div class='plots'>")
+        body.extend(_curves(own_rows, motions))
+        body.append("</div>")
+        body.append(_case_table(own_rows))
+    page = (
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Autofocus benchmark</title>"
+        f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _setting(chosen: CaseSet) -> str:
+    sensor = chosen.retina
+    return (
+        f"From {chosen.start_um:g} to {-chosen.start_um:g} um at {chosen.speed_um_s / 1e3:g} um/ms, depth of focus "
+        f"{chosen.depth_of_focus_um:g} um, {chosen.size_px} x {chosen.size_px} pixels, thresholds {sensor.pos_thres:g} "
+        f"± {sensor.sigma_thres:g}, photoreceptor {sensor.cutoff_hz:g} Hz, shot noise {sensor.shot_noise_rate_hz:g} Hz "
+        f"a pixel, a pixel of motion is {chosen.motion_px:.2g} of the sensor's."
+    )
+
+
+def _overview(table: Sequence[Score], motions: Sequence[str]) -> str:
+    """Return the paper's kind of table: a line per method and frame rate, MAE per motion, its number in brackets."""
+    methods = all_methods()
+    heads = "".join(f"<th>{escape(motion)}</th>" for motion in motions)
+    told = "MAE um; in brackets the paper's where it has one; +n cases without an answer, !n wrong answers"
+    lines = [f"<h3>{told}</h3><div class='scroll'><table>"]
+    lines.append(f"<tr><th class='word'>method</th><th class='word'>fps</th>{heads}</tr>")
+    by_pair: dict[tuple[str, str], dict[str, Score]] = {}
+    for score in table:
+        by_pair.setdefault((score.method, score.rate), {})[score.motion] = score
+    for (name, rate), found in by_pair.items():
+        lines.append(f"<tr{' class=ours' if name == OURS else ''}><td class='word'>{escape(methods[name].title)}</td>")
+        lines.append(f"<td class='word'>{rate}</td>")
+        lines.extend(f"<td>{_overview_cell(found[one]) if one in found else ''}</td>" for one in motions)
+        lines.append("</tr>")
+    return "".join(lines) + "</table></div>"
+
+
+def _overview_cell(score: Score) -> str:
+    published = "" if score.published_um is None else f" ({score.published_um:.2f})"
+    missed = f" +{score.missed}" if score.missed else ""
+    outside = f" <b>!{score.outside}</b>" if score.outside else ""
+    return f"{_number(score.mae_um)}{published}{missed}{outside}"
+
+
+def _score_table(table: Sequence[Score]) -> str:
+    methods = all_methods()
+    words = "".join(f"<th class='word'>{head}</th>" for head in ("method", "fps", "sees"))
+    numbers = "".join(f"<th>{head}</th>" for head in COLUMNS)
+    lines = [f"<div class='scroll'><table><tr>{words}{numbers}</tr>"]
+    for score in table:
+        method = methods[score.method]
+        told = "".join(f"<td class='word'>{escape(word)}</td>" for word in (method.title, score.rate, method.sees))
+        cells = ""
+        for name in COLUMNS.values():
+            value = getattr(score, name)
+            cells += f"<td{BAD if value and name in COUNTS_OF_TROUBLE else ''}>{_cell(value, name)}</td>"
+        lines.append(f"<tr{' class=ours' if score.method == OURS else ''}>{told}{cells}</tr>")
+    return "".join(lines) + "</table></div>"
+
+
+def _cell(value: float | None, name: str) -> str:
+    return str(value) if isinstance(value, int) else _number(value, signed=name in SIGNED)
+
+
+def _case_table(rows: Sequence[Row]) -> str:
+    """Return every case's errors: a line per case, a column per method and frame rate."""
+    pairs = list(dict.fromkeys((row.method, row.rate) for row in rows))
+    by_case: dict[str, dict[tuple[str, str], Row]] = {}
+    for row in rows:
+        by_case.setdefault(row.case, {})[row.method, row.rate] = row
+    heads = "".join(f"<th>{escape(method)}<br>{rate}</th>" for method, rate in pairs)
+    lines = [
+        "<details><summary>Every case: error in um, “/” where there was no answer (its reason on hover)</summary>",
+        f"<div class='scroll'><table><tr><th class='word'>case</th><th>events</th>{heads}</tr>",
+    ]
+    for case, found in by_case.items():
+        events = next(iter(found.values())).events
+        lines.append(f"<tr><td class='word'>{escape(case)}</td><td>{events}</td>")
+        for pair in pairs:
+            row = found[pair]
+            if row.error_um is None:
+                lines.append(f"<td title='{escape(row.reason, quote=True)}'>/</td>")
+            else:
+                bad = BAD if abs(row.error_um) > SETS[row.set_name].depth_of_focus_um else ""
+                lines.append(f"<td{bad}>{row.error_um:+.2f}</td>")
+        lines.append("</tr>")
+    return "".join(lines) + "</table></div></details>"
+
+
+def _errors(rows: Sequence[Row], motion: str) -> str:
+    """Draw the share of *all* cases with an error below x: lines that do not reach one have misses."""
+    series = []
+    for method, rate in PLOTTED:
+        own = [row for row in rows if (row.method, row.rate) == (method, rate)]
+        errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
+        if errors:
+            # A staircase, drawn on to the right edge at the share that had an answer at all.
+            corners = [corner for error in errors for corner in (error, error)] + [WORST_DRAWN_UM]
+            shares = [step / len(own) for k in range(len(errors)) for step in (k, k + 1)] + [len(errors) / len(own)]
+            series.append(Series(_label(method, rate), corners, shares))
+    marks = [(SETS[row.set_name].depth_of_focus_um, "depth of focus") for row in rows[:1]]
+    return draw(
+        Plot(
+            f"{motion}: share of cases below an error", "|error| um", "share of all cases", series,
+            log_x=True, x_range=(0.02, WORST_DRAWN_UM), y_range=(0.0, 1.0), marks=marks,
+        )
+    )  # fmt: skip
+
+
+def _calibration(rows: Sequence[Row]) -> str:
+    """Draw |error|/sigma of our own answers against what a normal error would give."""
+    grid = np.linspace(0.05, 5.0, 100)
+    normal = [math.erf(x / math.sqrt(2.0)) for x in grid]
+    series = [Series("normal", grid.tolist(), normal)]
+    for rate in all_methods()[OURS].rates:
+        own = [row for row in rows if (row.method, row.rate) == (OURS, rate)]
+        ratios = np.array(
+            [abs(row.error_um) / row.sigma_um for row in own if row.error_um is not None and row.sigma_um]
+        )
+        if ratios.size:
+            shares = [(ratios <= x).mean() for x in grid]
+            series.append(Series(_label(OURS, rate), grid.tolist(), shares))
+    title = "Is the claimed standard error true?"
+    return draw(Plot(title, "|error| / claimed sigma", "share of answers", series, y_range=(0.0, 1.0)))
+
+
+def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
+    """Draw the published ELP of the first case of each motion, at 50 fps and with the one future frame."""
+    plots = []
+    for motion in motions:
+        first = next((row.case for row in rows if row.motion == motion and "curve" in row.details), None)
+        series, marks = [], [(0.0, "truth")]
+        for row in rows:
+            if row.case != first or "curve" not in row.details:
+                continue
+            curve = row.details["curve"]
+            series.append(
+                Series(
+                    _label(row.method, row.rate),
+                    [SETS[row.set_name].position_um(t_us) for t_us in curve["t_us"]],
+                    curve["elp"],
+                )
+            )
+            if row.decided_um is not None:
+                marks.append((row.decided_um, f"decided, {_label(row.method, row.rate)}"))
+        plots.append(draw(Plot(str(first), "lens position um", "ELP per event", series, marks=marks)))
+    return plots
+
+
+def _label(method: str, rate: str) -> str:
+    return method if rate == "-" and method != OURS else f"{method}, {'no frames' if rate == '-' else rate + ' fps'}"
+
+
+def _number(value: float | None, *, signed: bool = False) -> str:
+    if value is None:
+        return "–"
+    return f"{value:+.2f}" if signed else f"{value:.2f}"
