@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import textwrap
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TextIO
@@ -185,8 +186,10 @@ def magnified(image: NDArray[np.float32], window: tuple[int, int, int, int], sid
 def _hello(config: Config) -> None:
     sim = config.sim
     print(
-        f"A simulated {sim.camera} looks at {sim.scene!r} through a lens on a {sim.board} board, "
-        f"{abs(sim.start_um):g} um out of focus.\nThe controller sees event bytes and serial replies, nothing else.",
+        _wrapped(
+            f"A simulated {sim.camera} looks at {sim.scene!r} through a lens on a {sim.board} board, "
+            f"{abs(sim.start_um):g} um out of focus. The controller sees event bytes and serial replies, nothing else."
+        ),
         flush=True,
     )
 
@@ -199,9 +202,9 @@ def _tell(shown: Demonstration, config: Config, stream: TextIO) -> None:
     left, right = (picture(part, columns, ink=ink, limits=shown.limits()) for part in (before, after))
     titles = (f"before, {shown.start_error_um:+.1f} um from focus"[:columns], "after")
     print(side_by_side(left, right, titles, columns), file=stream)
-    lines = ["", *_numbers(shown, config)]
+    lines = ["", *(_wrapped(line) for line in _numbers(shown, config))]
     if shown.session.run is not None:
-        lines.append(f"Recorded in {shown.session.run}, with {PICTURE} of the whole sensor.")
+        lines.append(f"Recorded in {shown.session.run}, with {PICTURE}.")
         lines.append(f"`elpd replay {shown.session.run}` decides the same again.")
     print(*lines, sep="\n", file=stream, flush=True)
 
@@ -223,8 +226,8 @@ def _numbers(shown: Demonstration, config: Config) -> list[str]:
     else:
         pace = "real time" if config.sim.pace == 1 else f"{config.sim.pace:g} times real time"
         if shown.behind_ms > 1000.0 * KEPT_PACE_S:
-            lines.append(f"{took}: simulating a sensor of this size fell {shown.behind_ms:.0f} ms")
-            lines.append(f"behind {pace}. No decision depends on it.")
+            behind = f"simulating a sensor of this size fell {shown.behind_ms:.0f} ms behind {pace}"
+            lines.append(f"{took}: {behind}. No decision depends on it.")
         else:
             lines.append(f"{took}, in {pace}.")
     return lines
@@ -232,3 +235,7 @@ def _numbers(shown: Demonstration, config: Config) -> list[str]:
 
 def _um(value: float | None) -> str:
     return "an unknown way" if value is None else f"{value:+.2f} um"
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, COLUMNS - 1, break_long_words=False, break_on_hyphens=False)

@@ -33,7 +33,7 @@ def test_without_a_terminal_the_demo_tells_its_story_in_plain_lines(
     assert told.code == 0
     assert ESCAPE not in told.out + told.err
     lines = told.out.splitlines()
-    assert max(map(len, lines)) <= 100
+    assert max(map(len, lines)) <= 80
     for part in (
         "expose",
         "sweep",
@@ -43,7 +43,7 @@ def test_without_a_terminal_the_demo_tells_its_story_in_plain_lines(
         "In focus. The lens",
     ):
         assert any(part in line for line in lines), part
-    assert any("virtual time" in line for line in lines)
+    assert "virtual time" in told.out
     (run,) = (tmp_path / "runs").iterdir()
     assert f"`elpd replay runs/{run.name}` decides the same again." in lines
     both = cv2.imread(str(run / "before-after.png"), cv2.IMREAD_UNCHANGED)
