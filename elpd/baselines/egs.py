@@ -48,7 +48,7 @@ def golden_search(t_us: NDArray[np.int64]) -> tuple[float, int]:
     while end - begin > STOP_US:
         first = int(np.searchsorted(t_us, begin, side="left"))
         last = int(np.searchsorted(t_us, end, side="right")) - 1
-        if last <= first:
+        if last <= first or t_us[last] <= t_us[first]:
             break
         begin, end = float(t_us[first]), float(t_us[last])
         span = end - begin

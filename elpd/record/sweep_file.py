@@ -176,6 +176,10 @@ class SweepSearch:
         times = self._frames.times_us
         return len(times) >= 3 and now_us - times[-1] <= 2.0 * float(np.median(np.diff(times)))
 
+    def _frames_are_too_coarse(self) -> bool:
+        """Whether frames have seen focus go by and yet have no vertex: the lens is too fast for them to draw a top."""
+        return self._frames.passed and self._frames.vertex() is None
+
     def _frames_may_come(self, now_us: int) -> bool:
         """Whether a camera that has sent one frame or two may yet show that it sends more."""
         times = self._frames.times_us
@@ -183,7 +187,7 @@ class SweepSearch:
 
     def _attempt(self, now_us: int) -> Detection | None:
         witnesses: list[Witness] = []
-        if self._frames_are_coming(now_us):
+        if self._frames_are_coming(now_us) and not self._frames_are_too_coarse():
             if not self._frames.passed or self._frames.times_us[-1] != now_us:
                 return None
             vertex = self._frames.vertex()
