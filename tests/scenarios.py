@@ -2,7 +2,7 @@
 
 ``play`` runs one cycle with spies between the cycle and its devices: they note what was asked and when, and change
 nothing. Misfortunes come as ``Event``: so many milliseconds after a phase began, do something to the world. Whatever
-the story, ``assert_invariants`` must hold at its end (``DESIGN`` §6); the test then says what else it expects.
+the story, ``assert_invariants`` must hold at its end; the test then says what else it expects.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def play(
 
 
 def assert_invariants(story: Story) -> None:
-    """What holds at the end of every story (``DESIGN`` §6)."""
+    """What holds at the end of every story."""
     _one_ending(story)
     _limits_held(story)
     _motion_ended(story)

@@ -35,7 +35,7 @@ FILTER_THRESHOLD = 5e4
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """One data set's constants (``algorithms.md`` §1.3).
+    """One data set's constants.
 
     The rule fires when the filtered series has fallen below ``below`` and, for ``tail_bins == 0``, spans more than
     ``span`` over its whole history; else when the last ``tail_bins`` reach below ``below`` and all before rise above

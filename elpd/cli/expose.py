@@ -20,9 +20,8 @@ def command(*, out: Path | None, config_path: Path | None, overrides: tuple[str,
     """Open the aperture and make the temporal map: exit 0 with a map of quality, 1 without."""
     config = load(config_path, overrides)
     from elpd import rig  # noqa: PLC0415  (numba and devices only now)
-    from elpd.focus.cycle import REST_LIMIT_MS  # noqa: PLC0415
     from elpd.focus.expose import expose  # noqa: PLC0415
-    from elpd.focus.stage import Stage  # noqa: PLC0415
+    from elpd.focus.stage import REST_LIMIT_MS, Stage  # noqa: PLC0415
     from elpd.focus.stored_map import StoredMap, save  # noqa: PLC0415
     from elpd.vision.pictures import write_log_png  # noqa: PLC0415
 

@@ -1,7 +1,7 @@
 """One focus cycle: expose, choose, probe, sweep, stop, return, verify, report.
 
 The cycle is a straight line read from top to bottom. A phase that finds out that focus cannot be had leaves by
-``_Ended`` with an outcome and a sentence for the person; broken machinery leaves as ``DeviceError`` after the strongest
+``Ended`` with an outcome and a sentence for the person; broken machinery leaves as ``DeviceError`` after the strongest
 stop has been sent. Either way the lens ends at a declared place or at rest, and there is exactly one result.
 
 The lens is not left where it stopped: the stop comes late by physics (a pixel must travel its leftover threshold and
@@ -13,12 +13,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
-from elpd.errors import CameraError, DeviceError, UsageError
+from elpd.errors import DeviceError, UsageError
 from elpd.focus import safety
+from elpd.focus.approach import go_back, latency_us, verify
+from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
-from elpd.focus.stage import Stage
-from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
+from elpd.focus.search import Search
+from elpd.focus.stage import REST_LIMIT_MS, Stage
 from elpd.focus.watch import Watch, WatchSettings
 from elpd.ports import Biases, HardwareRoi
 from elpd.records import (
@@ -31,7 +33,7 @@ from elpd.records import (
     Roi,
     StopMode,
 )
-from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
+from elpd.units import NS_PER_MS, HostNs, after_ms
 from elpd.vision.choose import propose_roi
 from elpd.vision.reference import reference_from_frame
 
@@ -39,8 +41,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.focus.settings import CycleSettings, FocusRequest
+    from elpd.focus.sweep import SweepReport
     from elpd.ports import RigParts, RunSink
-    from elpd.records import ElpSample, LensReport, TemporalImage
+    from elpd.records import ElpSample, TemporalImage
     from elpd.vision.reference import Reference
 
 BIAS_SETTLE_MS = 10.0
@@ -49,20 +52,6 @@ BIAS_SETTLE_MS = 10.0
 FRAME_LIMIT_MS = 500.0
 """A camera with frames delivers one within this, or has none."""
 
-REJOG_S = 0.25
-"""What a controller without a velocity mode takes from one jog to the opposite one, beside braking."""
-
-REST_LIMIT_MS = 1500.0
-"""No lens this is for rings or brakes longer; past it the lens does not obey."""
-
-APPROACH_MARGIN_UM = 2.0
-"""How much further than the backlash the final approach begins."""
-
-RETURN_SHARE = 0.5
-"""The way back leads over the same ground as the way out, and beyond: half its events at the least."""
-
-LIT_SHARE = 0.5
-"""Half of the region's pixels answer when an aperture closes over a scene in the light; most do several times."""
 
 ROI_MARGIN_PX = 14
 """Pixels around the ROI that the sensor keeps on: filters need neighbours, motion needs room."""
@@ -78,15 +67,6 @@ class Observer(Protocol):
     def sample(self, sample: ElpSample, score: float, /) -> None:
         """Hear of one window."""
         ...
-
-
-class _Ended(Exception):  # noqa: N818  (an early end of the cycle, not an error)
-    """Focus cannot be had; leave with an outcome."""
-
-    def __init__(self, outcome: Outcome, reason: str) -> None:
-        super().__init__(reason)
-        self.outcome = outcome
-        self.reason = reason
 
 
 class FocusCycle:
@@ -153,7 +133,7 @@ class FocusCycle:
             try:
                 self._stage.interrupt = self._interrupt
                 outcome, reason = self._focus()
-            except _Ended as ended:
+            except Ended as ended:
                 outcome, reason = ended.outcome, ended.reason
                 self._go_to_declared_place()
             self._stage.interrupt = None
@@ -178,14 +158,20 @@ class FocusCycle:
         roi, reference = self._choose(picture)
         watch = self._arm(reference, roi, frames=picture.map is None)
         if self._request.dry_run:
-            raise _Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
+            raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         passed = self._search(watch)
         self._phase(Phase.STOP)
         rest = self._stage.rest(REST_LIMIT_MS)
-        self._stop_um = self._stage.to_um(rest.steps)
-        self._stop_latency_us = self._latency_us(watch, rest)
-        estimate = self._judge(watch, passed)
-        self._return(estimate, passed)
+        stop_um = self._stop_um = self._stage.to_um(rest.steps)
+        self._stop_latency_us = latency_us(self._stage, watch, rest)
+        sign = self._details["sweep_sign"]
+        estimate = self._judge(watch, sign, passed.begun_um, stop_um)
+        self._phase(Phase.RETURN)
+        way = go_back(self._stage, watch, self._settings, estimate.focus_um, sign)
+        self._phase(Phase.VERIFY)
+        self._details["return_events"] = verify(
+            self._stage, watch, self._settings, way, focus_um=estimate.focus_um, stop_um=stop_um
+        )
         return Outcome.FOCUSED, self._sentence(estimate)
 
     def _picture(self) -> Picture:
@@ -216,7 +202,7 @@ class FocusCycle:
                 dynamic_range_db=self.map.dynamic_range_db,
             )
         if self.map is None or not good:
-            raise _Ended(Outcome.NO_TEXTURE, reason)
+            raise Ended(Outcome.NO_TEXTURE, reason)
         return Picture.of_map(self.map)
 
     def _choose(self, picture: Picture) -> tuple[Roi, Reference]:
@@ -226,12 +212,12 @@ class FocusCycle:
             side = round(self._settings.roi_fraction * min(geometry.width, geometry.height))
             roi = propose_roi(picture.log_image, picture.valid, (side, side))
         if roi is None:
-            raise _Ended(Outcome.NO_TEXTURE, "nothing in the picture has texture above its noise; aim at a subject")
+            raise Ended(Outcome.NO_TEXTURE, "nothing in the picture has texture above its noise; aim at a subject")
         self._details["roi"] = [roi.x, roi.y, roi.width, roi.height]
         reference = picture.reference(roi)
         self._sink.note("roi", roi=self._details["roi"], texture=reference.texture, scale_px=reference.scale_px)
         if not reference.textured:
-            raise _Ended(
+            raise Ended(
                 Outcome.NO_TEXTURE,
                 f"the picture shows no structure above its own noise in the ROI ({reference.texture:.1f} sigma, "
                 "at least 6 are needed); choose another ROI or add light",
@@ -262,104 +248,31 @@ class FocusCycle:
         return watch
 
     def _search(self, watch: Watch) -> SweepReport:
-        """Sweep, reversing while focus lies behind, until it has been passed. Leaves with the lens told to stop."""
+        """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
         self._phase(Phase.PROBE)
-        capabilities, limits = self._parts.lens.capabilities, self._parts.lens.limits
-        if not capabilities.stop_on_command:
-            raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
-        speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
-        braking_um = self._braking_um(speed_um_s)
-        turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
-        if not capabilities.native_velocity:
-            turn_s += REJOG_S
-        slow = braking_um > 5 * self._settings.depth_of_focus_um
-        self._details["strategy"] = "sweep_and_return" if slow else "stop_on_detect"
-        sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
-        sign = self._first_sign()
-        reach_um = self._settings.max_travel_um
-        turned_at_um: float | None = None
-        lit, dark = False, True
-        while True:
-            self._details["sweep_sign"] = sign
-            plan = SweepPlan(
-                sign=sign,
-                speed_um_s=speed_um_s,
-                max_travel_um=reach_um,
-                braking_um=braking_um,
-                turn_s=turn_s,
-                deadline_ns=self._deadline_ns,
-                depth_of_focus_um=self._settings.depth_of_focus_um,
-                stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
-                turned_at_um=turned_at_um,
-                lit=lit,
-            )
-            self._phase(Phase.SWEEP, sign=sign, position_um=self._here_um())
-            self._stage.listener = self._stage.interrupt = None  # the sweep asks for itself, and stops the lens first
-            report = sweep.run(plan)
-            self._sink.note(
-                "sweep",
-                sign=sign,
-                end=report.end.value,
-                begun_um=report.begun_um,
-                ended_um=self._here_um(),
-                events=watch.events,
-                reason=report.verdict.reason,
-            )
-            if report.end is SweepEnd.PASSED:
-                self._stage.listener, self._stage.interrupt = watch.keep, self._interrupt
-                return report
-            if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
-                if report.verdict.outcome is Outcome.TOO_FEW_EVENTS and self._in_the_light(watch):
-                    lit, reach_um = True, reach_um - abs(self._here_um() - report.begun_um)
-                    continue  # far from focus a lens may go a long way before anything changes
-                raise self._rule(report.verdict)
-            dark = dark and report.end is SweepEnd.RULE and report.dark
-            if self._reversals >= self._settings.max_reversals:
-                if lit and dark:
-                    raise _Ended(
-                        Outcome.LENS_DID_NOT_MOVE,
-                        "nothing changed while the lens should have moved, and yet the scene is in the light: the "
-                        "aperture shows it; check the coupling, and that the motor turns",
-                    )
-                if report.end is SweepEnd.RULE:
-                    raise self._rule(report.verdict)
-                raise _Ended(
-                    Outcome.NO_CROSSING,
-                    f"focus seemed to lie behind {self._reversals + 1} times; "
-                    "does the subject move in depth? raise focus.max_reversals or hold it still",
-                )
-            turned_at_um = self._here_um() if report.end is SweepEnd.BEHIND else None
-            if report.end is SweepEnd.RULE:
-                self._stage.rest(REST_LIMIT_MS)
-            self._reversals += 1
-            reach_um = self._settings.max_travel_um + abs(self._here_um() - report.begun_um) + 2 * braking_um
-            sign = -sign
-
-    def _in_the_light(self, watch: Watch) -> bool:
-        """Ask the aperture, if it made this cycle's picture: every lit pixel answers when it closes."""
-        aperture, stage = self._parts.aperture, self._stage
-        if aperture is None or self.map is None:
-            return False
-        stage.listener, stage.interrupt = watch.count, self._interrupt
-        stage.rest(REST_LIMIT_MS)
-        before, begun_ns = watch.events_in_cycle, stage.now_ns()
-        aperture.close()
+        search = Search(
+            self._stage,
+            watch,
+            self._settings,
+            self._deadline_ns,
+            exposed=self.map is not None,
+            sink=self._sink,
+            enter=self._phase,
+            observe=self._observe,
+            cancelled=self._cancelled,
+            interrupt=self._interrupt,
+        )
         try:
-            stage.wait_ms(aperture.opening_ms)
-            stage.hear(safety.CAMERA_SILENCE_MS)
+            return search.run()
         finally:
-            aperture.open()
-        noise = watch.resting_rate_hz * (stage.now_ns() - begun_ns) / NS_PER_S
-        answers = watch.events_in_cycle - before - noise
-        stage.wait_ms(AFTER_FACTOR * aperture.opening_ms)
-        _, _, width, height = self._details["roi"]
-        return bool(answers > LIT_SHARE * width * height)
+            self._reversals = search.reversals
+            self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
-    def _judge(self, watch: Watch, passed: SweepReport) -> FocusEstimate:
+    def _judge(self, watch: Watch, sign: int, begun_um: float, stop_um: float) -> FocusEstimate:
         """Say where focus was, and refuse an answer that the evidence does not carry."""
         estimate = watch.estimate()
         if estimate is None:
-            raise _Ended(
+            raise Ended(
                 Outcome.LOW_CONFIDENCE,
                 "the sign changed, but no estimator agrees on where; try again with a larger ROI or more light",
             )
@@ -368,66 +281,25 @@ class FocusCycle:
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
         if watch.gap_near_crossing:
-            raise _Ended(
+            raise Ended(
                 Outcome.EVENTS_LOST,
                 f"events were lost while focus was passed ({self._stage.lost_events} known); "
                 "choose a smaller ROI or a slower sweep",
             )
         limit_um = self._settings.max_sigma_dof * self._settings.depth_of_focus_um
         if estimate.sigma_um > limit_um:
-            raise _Ended(
+            raise Ended(
                 Outcome.LOW_CONFIDENCE,
                 f"focus is known to {estimate.sigma_um:.1f} um only (limit {limit_um:.1f}); "
                 "choose a ROI with more contrast, more light, or less motion",
             )
-        stop_um = self._stop_um
-        sign = self._details["sweep_sign"]
-        if stop_um is not None and sign * (estimate.focus_um - stop_um) > self._settings.depth_of_focus_um:
-            raise _Ended(
+        if sign * (estimate.focus_um - stop_um) > self._settings.depth_of_focus_um:
+            raise Ended(
                 Outcome.LOW_CONFIDENCE,
-                f"focus was put at {estimate.focus_um:.1f} um, which the sweep ({passed.begun_um:.1f} to "
+                f"focus was put at {estimate.focus_um:.1f} um, which the sweep ({begun_um:.1f} to "
                 f"{stop_um:.1f}) has not reached",
             )
         return estimate
-
-    def _return(self, estimate: FocusEstimate, passed: SweepReport) -> None:
-        """Go back to where focus was, from the side the sweep came from, and see that the lens is there."""
-        del passed
-        self._phase(Phase.RETURN)
-        stage, watch, settings = self._stage, self._watch, self._settings
-        if watch is None or self._stop_um is None:
-            raise AssertionError("a return needs a stop")
-        limits = self._parts.lens.limits
-        sign = self._details["sweep_sign"]
-        way_back_um = abs(self._stop_um - estimate.focus_um)
-        expected = watch.events_within(estimate.focus_um, self._stop_um)
-        before, begun_ns = watch.events_in_cycle, stage.now_ns()
-        stage.listener = watch.count
-        beyond_um = estimate.focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM)
-        rest = None
-        for target_um in (beyond_um, estimate.focus_um):
-            bounded = min(max(stage.to_steps(target_um), limits.min_steps), limits.max_steps)
-            rest = stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
-        self._phase(Phase.VERIFY)
-        if rest is None:
-            raise AssertionError("two moves end in a rest")
-        error_um = stage.to_um(rest.steps) - estimate.focus_um
-        if abs(error_um) > max(0.25 * settings.depth_of_focus_um, 2 * stage.um_per_step):
-            raise _Ended(
-                Outcome.LENS_DID_NOT_MOVE,
-                f"the lens rests {error_um:+.1f} um from where it was sent; check the motor current and the mechanics",
-            )
-        stage.hear(safety.CAMERA_SILENCE_MS)
-        resting_hz = watch.resting_rate_hz
-        seen = watch.events_in_cycle - before - round(resting_hz * (stage.now_ns() - begun_ns) / NS_PER_S)
-        expected -= round(resting_hz * way_back_um / settings.speed_um_s)
-        self._details["return_events"] = seen
-        if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
-            raise _Ended(
-                Outcome.LENS_DID_NOT_MOVE,
-                f"the controller says that the lens went back {way_back_um:.0f} um, but the scene did not change "
-                f"({seen} events above noise, {expected} on the way out); check the coupling between motor and lens",
-            )
 
     # --- the pieces ---
 
@@ -444,22 +316,6 @@ class FocusCycle:
                 f"the ROI {roi.width}x{roi.height} is too small to hold texture (at least 8x8); draw a larger one"
             )
 
-    def _first_sign(self) -> int:
-        if self._settings.first_direction != "auto":
-            return 1 if self._settings.first_direction == "up" else -1
-        limits = self._parts.lens.limits
-        here = self._here_um() / self._stage.um_per_step
-        return 1 if limits.max_steps - here >= here - limits.min_steps else -1
-
-    def _braking_um(self, speed_um_s: float) -> float:
-        """Return the way from the stop command to rest."""
-        capabilities, limits = self._parts.lens.capabilities, self._parts.lens.limits
-        onset_ms = capabilities.stop_onset_ms + 2 * capabilities.stop_onset_sigma_ms
-        ramp_um = 0.0
-        if not capabilities.abrupt_stop:
-            ramp_um = speed_um_s**2 / (2 * self._stage.to_um(limits.acceleration_sps2))
-        return speed_um_s * onset_ms / 1000.0 + ramp_um
-
     def _rest_um(self) -> float:
         """Return where the lens rests: by its newest report if that says so, else after waiting for one."""
         report = self._stage.report
@@ -468,22 +324,12 @@ class FocusCycle:
             report.steps if resting and report is not None else self._stage.rest(REST_LIMIT_MS).steps
         )
 
-    def _here_um(self) -> float:
-        return self._stage.to_um(self._parts.lens.position_at(self._stage.now_ns()).steps)
-
     def _interrupt(self) -> None:
         """End a phase that waits, if somebody asked for it or time is up."""
         ms_to_deadline = (self._deadline_ns - self._stage.now_ns()) / NS_PER_MS
         verdict = safety.decide(safety.Conditions(cancelled=self._cancelled(), ms_to_deadline=ms_to_deadline))
         if verdict.action is not safety.Action.CONTINUE:
-            raise self._rule(verdict)
-
-    def _rule(self, verdict: safety.Verdict) -> Exception:
-        if verdict.action is safety.Action.FAULT:
-            return CameraError(verdict.reason)
-        if verdict.outcome is None:
-            raise AssertionError(f"a rule without an outcome: {verdict}")
-        return _Ended(verdict.outcome, verdict.reason)
+            raise ended_by(verdict)
 
     def _go_to_declared_place(self) -> None:
         """After anything but FOCUSED: hold, start or preset. A *settled* start, read before anything moved."""
@@ -491,7 +337,7 @@ class FocusCycle:
         self._parts.lens.stop(StopMode.RAMPED)
         self._stage.rest(REST_LIMIT_MS)
         place = {"hold": None, "start": self._start_um, "preset": self._settings.preset_um}[self._settings.on_failure]
-        if place is None or abs(self._here_um() - place) < self._stage.um_per_step:
+        if place is None or abs(self._stage.here_um() - place) < self._stage.um_per_step:
             return
         self._stage.move(place, self._settings.speed_um_s, self._parts.lens.limits.acceleration_sps2)
 
@@ -502,20 +348,10 @@ class FocusCycle:
         except DeviceError as error:
             self._sink.note("stop failed", error=str(error))
 
-    def _latency_us(self, watch: Watch, rest: LensReport) -> int | None:
-        """Return the time from the closing of the deciding window to the motor's last step."""
-        if watch.decided_us is None:
-            return None
-        decided_ns = self._stage.sensor_clock.to_host(watch.decided_us)
-        lens, when = self._parts.lens, HostNs(rest.latest_ns)
-        while when > decided_ns and abs(lens.position_at(when).steps - rest.steps) < 1.0:
-            when = HostNs(when - NS_PER_MS // 8)
-        return int(max(0, when - decided_ns) // NS_PER_US)
-
     def _sentence(self, estimate: FocusEstimate) -> str:
         return f"in focus at {estimate.focus_um:.2f} um, known to {estimate.sigma_um:.2f} um by {estimate.method}"
 
-    def _phase(self, phase: Phase, **fields: Any) -> None:
+    def _phase(self, phase: Phase, /, **fields: Any) -> None:
         now = self._stage.now_ns()
         if not self._phases or self._phases[-1][0] is not phase:
             self._phases.append((phase, now))
@@ -570,7 +406,7 @@ def widened(roi: Roi, margin_px: int, width: int, height: int) -> Roi:
 
 
 def result_fields(result: FocusResult) -> dict[str, Any]:
-    """Return the stable JSON fields of a result (``DESIGN`` §7), with its details beside them."""
+    """Return the stable JSON fields of a result (docs/json.md), with its details beside them."""
     return {
         "outcome": result.outcome.value,
         "reason": result.reason,

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 READ_TIMEOUT_S = 0.002
 """One turn of a wait; the lens is polled at least this often."""
 
+REST_LIMIT_MS = 1500.0
+"""No lens this is for rings or brakes longer; past it the lens does not obey."""
+
 SILENCE_MS = 200.0
 """Outside a sweep a camera may take this long to speak (bias changes, windows) before it counts as lost."""
 
@@ -62,6 +65,10 @@ class Stage:
     def position_um(self, when: SensorUs) -> float:
         """Return where the motor was at a sensor time."""
         return self.to_um(self.parts.lens.position_at(self.sensor_clock.to_host(when)).steps)
+
+    def here_um(self) -> float:
+        """Return where the motor is now."""
+        return self.to_um(self.parts.lens.position_at(self.now_ns()).steps)
 
     # --- waiting ---
 

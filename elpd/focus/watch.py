@@ -64,7 +64,7 @@ SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
 
 SIGMAS_AFTER_REVERSAL = 9.0
-"""A false reversal costs the most: the second needs this many standard deviations (``facts/detection.md`` §6)."""
+"""A false reversal costs the most: the second needs this many standard deviations."""
 
 SLOW_SHARE = 0.2
 """Windows with less than this share of the planned travel say little: the lens starts, stops or turns."""
@@ -115,7 +115,7 @@ class Watch:
         rereference: Rereference | None = None,
     ) -> None:
         self._reference = reference
-        self._roi = roi
+        self.roi = roi
         self._geometry = geometry
         self._settings = settings
         self._locate = locate
@@ -182,7 +182,7 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self._roi, self._geometry)
+        self._memory = EventMemory(self.roi, self._geometry)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
@@ -357,7 +357,7 @@ class Watch:
     def _ask_frames(self) -> list[Witness]:
         """Ask the frames of this sweep, where three or more saw focus come and go."""
         track = PeakTrack()
-        energy = FrameEnergy(self._roi, ROI_MARGIN_PX)
+        energy = FrameEnergy(self.roi, ROI_MARGIN_PX)
         for frame in self._frames:
             if frame.t_us >= self._begun_us:
                 track.add(int(frame.t_us), self._sign * self._locate(frame.t_us), energy.measure(frame.pixels))

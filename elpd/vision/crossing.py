@@ -115,7 +115,7 @@ class EventStretch:
 class Lag:
     """How far the lens went while the brightest photoreceptors answered, and one standard error.
 
-    A pixel ``s`` times slower than the brightest is late by ``s`` times this (``facts/detection.md`` §7).
+    A pixel ``s`` times slower than the brightest is late by ``s`` times this.
     ``typical`` is the mean slowness of the pixels that had a say.
     """
 

@@ -2,7 +2,7 @@
 
 ``dS/dt`` of ``S = Σ A·|B·L|²`` (B a band-pass, L the log image) *is* the Event Laplacian Product with a reference that
 is always current. S depends on the amplitude spectrum alone, so scene motion leaves it unchanged, and a Gaussian blur
-makes ``log S`` a parabola in the lens position whose vertex is focus (``facts/motion.md``). No registration, no sharp
+makes ``log S`` a parabola in the lens position whose vertex is focus. No registration, no sharp
 picture, no contrast threshold: L is counted in thresholds, from zero at the start of the sweep. What the start picture
 looked like does not matter, because ``|h(z) - h(z_start)|²`` is as symmetric in defocus as ``|h(z)|²``.
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from elpd.vision.ruler import Ruler
 
 MIN_EVENTS = 1_000
-"""Fewer events between the flank of the peak and now make no image worth a vertex (``facts/motion.md`` §4)."""
+"""Fewer events between the flank of the peak and now make no image worth a vertex."""
 
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""

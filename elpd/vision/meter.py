@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from elpd.vision.ruler import Ruler
 
 TRAVEL_PER_DEPTH_OF_FOCUS = 0.2
-"""Travel of one window; between 0.15 and 0.3 nothing changes (``facts/detection.md`` §3)."""
+"""Travel of one window; between 0.15 and 0.3 nothing changes."""
 
 PIXELS_PER_EVENT = 128
 MIN_EVENTS_PER_WINDOW = 256

@@ -3,9 +3,8 @@
 Near focus a pixel's log intensity rises to an extremum and comes back. Its events sample that curve at levels one
 threshold apart: after a run of two or more equal events at t0 and t1, the first opposite event at t2 lies one threshold
 below t1's level, which is t0's level. Equal level before and after the turn means equal blur, so focus is the midpoint
-of the *lens positions* at t0 and t2, for any contrast, threshold, texture or blur curve that is symmetric in focus
-(``facts/detection.md`` §2). The sign change of the Event Laplacian Product has no such luck: it is late by a
-contrast-dependent amount.
+of the *lens positions* at t0 and t2, for any contrast, threshold, texture or blur curve that is symmetric in focus.
+The sign change of the Event Laplacian Product has no such luck: it is late by a contrast-dependent amount.
 
 Many pixels also turn for other reasons (noise, an edge sweeping over them), so pairs are gated by sign and time and
 combined by their weighted *mode*, not their mean. Scene motion makes mirrors of its own: pairs alone are not to be

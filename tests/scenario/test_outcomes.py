@@ -1,4 +1,4 @@
-"""Every outcome of ``DESIGN`` §4, reached by the misfortune that it names."""
+"""Every outcome that a cycle can have, reached by the misfortune that it names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FAULTS 24 and 25: cycles that begin in focus, beyond it or at a limit; regions that cannot be focused on."""
+"""Cycles that begin in focus, beyond it or at a limit; regions that cannot be focused on."""
 
 from __future__ import annotations
 

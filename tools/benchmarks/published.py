@@ -1,7 +1,7 @@
 """The paper's own numbers (um), to stand beside ours: its tables for the synthetic set, recomputed from its 84 rows.
 
 An estimate made in hindsight with tuned offsets is what the paper reports for ELP; it says nothing about when the
-decision was made. ``algorithms.md`` §7 has the sources.
+decision was made.
 """
 
 from __future__ import annotations

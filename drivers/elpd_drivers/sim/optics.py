@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SIGMA0_PX = 0.35
 BLUR_PX_PER_DEPTH = 0.0233 * 6.0
-"""Blur in px at one depth of focus from focus (``facts/detection.md`` §0: 0.0233 px/um at 6 um)."""
+"""Blur in px at one depth of focus from focus (0.0233 px/um at a depth of focus of 6 um)."""
 
 DARK = 0.01
 """Dark current of the photoreceptor in units of the brightest pixel's photocurrent.

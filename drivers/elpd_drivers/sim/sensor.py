@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LAG_US_AT_FULL = 60.0
-"""Photoreceptor time constant at intensity 1: 0.3 ms at 0.2, and so on (``facts/detection.md`` §0)."""
+"""Photoreceptor time constant at intensity 1: 0.3 ms at 0.2, and so on."""
 
 SLOWEST_LAG_US = 2_000.0
 MISMATCH_SD = 0.035

@@ -1,0 +1,199 @@
+"""Probe and sweep, one direction after the other, until focus has been passed or cannot be had."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from elpd.errors import UsageError
+from elpd.focus import safety
+from elpd.focus.ended import Ended, ended_by
+from elpd.focus.expose import AFTER_FACTOR
+from elpd.focus.stage import REST_LIMIT_MS
+from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
+from elpd.records import Outcome, Phase, StopMode
+from elpd.units import NS_PER_S, HostNs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from elpd.focus.settings import CycleSettings
+    from elpd.focus.stage import Stage
+    from elpd.focus.watch import Watch
+    from elpd.ports import RunSink
+    from elpd.records import ElpSample
+
+REJOG_S = 0.25
+"""What a controller without a velocity mode takes from one jog to the opposite one, beside braking."""
+
+LIT_SHARE = 0.5
+"""Half of the region's pixels answer when an aperture closes over a scene in the light; most do several times."""
+
+
+class EnterPhase(Protocol):
+    """How a search says where it is."""
+
+    def __call__(self, phase: Phase, /, **fields: float) -> None:
+        """Note a phase and what is worth knowing of it."""
+        ...
+
+
+class Search:
+    """Looks for focus over a stage.
+
+    Parameters
+    ----------
+    stage, watch, settings
+        The rig, what watches its events, and the numbers.
+    deadline_ns
+        No motion outlives it.
+    exposed
+        Whether this cycle's picture was made by opening the aperture, which then can tell darkness from a stuck lens.
+    sink, enter, observe
+        Where notes go, and who hears of phases and windows.
+    cancelled, interrupt
+        Whether somebody wants an end, and what ends a wait.
+
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        watch: Watch,
+        settings: CycleSettings,
+        deadline_ns: HostNs,
+        *,
+        exposed: bool,
+        sink: RunSink,
+        enter: EnterPhase,
+        observe: Callable[[ElpSample, float], None],
+        cancelled: Callable[[], bool],
+        interrupt: Callable[[], None],
+    ) -> None:
+        self._stage = stage
+        self._lens = stage.parts.lens
+        self._watch = watch
+        self._settings = settings
+        self._deadline_ns = deadline_ns
+        self._exposed = exposed
+        self._sink = sink
+        self._phase = enter
+        self._observe = observe
+        self._cancelled = cancelled
+        self._interrupt = interrupt
+        self.reversals = 0
+        self.sign = 0
+        """Direction of the present or last sweep."""
+        self.strategy = ""
+
+    def run(self) -> SweepReport:
+        """Sweep, reversing while focus lies behind, until it has been passed. Leaves with the lens told to stop.
+
+        Raises ``Ended`` when focus cannot be had, ``DeviceError`` when machinery breaks.
+        """
+        watch = self._watch
+        capabilities, limits = self._lens.capabilities, self._lens.limits
+        if not capabilities.stop_on_command:
+            raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
+        speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
+        braking_um = self._braking_um(speed_um_s)
+        turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
+        if not capabilities.native_velocity:
+            turn_s += REJOG_S
+        slow = braking_um > 5 * self._settings.depth_of_focus_um
+        self.strategy = "sweep_and_return" if slow else "stop_on_detect"
+        sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
+        sign = self._first_sign()
+        reach_um = self._settings.max_travel_um
+        turned_at_um: float | None = None
+        lit, dark = False, True
+        while True:
+            self._stage.listener = self._stage.interrupt = None  # a sweep asks for itself, and stops the lens first
+            self.sign = sign
+            plan = SweepPlan(
+                sign=sign,
+                speed_um_s=speed_um_s,
+                max_travel_um=reach_um,
+                braking_um=braking_um,
+                turn_s=turn_s,
+                deadline_ns=self._deadline_ns,
+                depth_of_focus_um=self._settings.depth_of_focus_um,
+                stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
+                turned_at_um=turned_at_um,
+                lit=lit,
+            )
+            self._phase(Phase.SWEEP, sign=sign, position_um=self._stage.here_um())
+            report = sweep.run(plan)
+            self._sink.note(
+                "sweep",
+                sign=sign,
+                end=report.end.value,
+                begun_um=report.begun_um,
+                ended_um=self._stage.here_um(),
+                events=watch.events,
+                reason=report.verdict.reason,
+            )
+            if report.end is SweepEnd.PASSED:
+                self._stage.listener, self._stage.interrupt = watch.keep, self._interrupt
+                return report
+            if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
+                if report.verdict.outcome is Outcome.TOO_FEW_EVENTS and self._in_the_light():
+                    lit, reach_um = True, reach_um - abs(self._stage.here_um() - report.begun_um)
+                    continue  # far from focus a lens may go a long way before anything changes
+                raise ended_by(report.verdict)
+            dark = dark and report.end is SweepEnd.RULE and report.dark
+            if self.reversals >= self._settings.max_reversals:
+                if lit and dark:
+                    raise Ended(
+                        Outcome.LENS_DID_NOT_MOVE,
+                        "nothing changed while the lens should have moved, and yet the scene is in the light: the "
+                        "aperture shows it; check the coupling, and that the motor turns",
+                    )
+                if report.end is SweepEnd.RULE:
+                    raise ended_by(report.verdict)
+                raise Ended(
+                    Outcome.NO_CROSSING,
+                    f"focus seemed to lie behind {self.reversals + 1} times; "
+                    "does the subject move in depth? raise focus.max_reversals or hold it still",
+                )
+            turned_at_um = self._stage.here_um() if report.end is SweepEnd.BEHIND else None
+            if report.end is SweepEnd.RULE:
+                self._stage.rest(REST_LIMIT_MS)
+            self.reversals += 1
+            reach_um = self._settings.max_travel_um + abs(self._stage.here_um() - report.begun_um) + 2 * braking_um
+            sign = -sign
+
+    def _in_the_light(self) -> bool:
+        """Ask the aperture, if it made this cycle's picture: every lit pixel answers when it closes."""
+        aperture, stage = self._stage.parts.aperture, self._stage
+        watch = self._watch
+        if aperture is None or not self._exposed:
+            return False
+        stage.listener, stage.interrupt = watch.count, self._interrupt
+        stage.rest(REST_LIMIT_MS)
+        before, begun_ns = watch.events_in_cycle, stage.now_ns()
+        aperture.close()
+        try:
+            stage.wait_ms(aperture.opening_ms)
+            stage.hear(safety.CAMERA_SILENCE_MS)
+        finally:
+            aperture.open()
+        noise = watch.resting_rate_hz * (stage.now_ns() - begun_ns) / NS_PER_S
+        answers = watch.events_in_cycle - before - noise
+        stage.wait_ms(AFTER_FACTOR * aperture.opening_ms)
+        return bool(answers > LIT_SHARE * watch.roi.width * watch.roi.height)
+
+    def _first_sign(self) -> int:
+        if self._settings.first_direction != "auto":
+            return 1 if self._settings.first_direction == "up" else -1
+        limits = self._lens.limits
+        here = self._stage.here_um() / self._stage.um_per_step
+        return 1 if limits.max_steps - here >= here - limits.min_steps else -1
+
+    def _braking_um(self, speed_um_s: float) -> float:
+        """Return the way from the stop command to rest."""
+        capabilities, limits = self._lens.capabilities, self._lens.limits
+        onset_ms = capabilities.stop_onset_ms + 2 * capabilities.stop_onset_sigma_ms
+        ramp_um = 0.0
+        if not capabilities.abrupt_stop:
+            ramp_um = speed_um_s**2 / (2 * self._stage.to_um(limits.acceleration_sps2))
+        return speed_um_s * onset_ms / 1000.0 + ramp_um
