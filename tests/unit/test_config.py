@@ -70,5 +70,7 @@ def test_a_wrong_override_is_refused(override: str) -> None:
 
 @given(st.text(max_size=40))
 def test_no_override_makes_a_traceback(override: str) -> None:
+    loaded: Config | None = None
     with contextlib.suppress(ElpdError):
-        load(None, [override])
+        loaded = load(None, [override])
+    assert loaded is None or isinstance(loaded, Config)

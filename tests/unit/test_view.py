@@ -116,10 +116,15 @@ def test_a_terminal_that_goes_away_does_not_disturb_the_cycle(monkeypatch: pytes
     monkeypatch.setenv("TERM", "xterm")
 
     class Gone(Terminal):
+        asked = 0
+
         def write(self, text: str) -> int:
+            self.asked += 1
             raise OSError(5, "Input/output error")
 
-    watch_a_sweep(open_view(Gone()))
+    gone = Gone()
+    watch_a_sweep(open_view(gone))
+    assert gone.asked >= 1
 
 
 def test_a_terminal_that_takes_nothing_does_not_hold_the_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
