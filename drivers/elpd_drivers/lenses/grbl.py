@@ -44,6 +44,7 @@ from elpd_drivers.lenses.grbl_lines import (
     jog_line,
     parse_status,
 )
+from elpd_drivers.lenses.latched import LatchedPort
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -88,7 +89,7 @@ class GrblLens:
     """``elpd.ports.Lens`` on GRBL. Use ``open_lens``."""
 
     def __init__(self, settings: GrblLensSettings, clock: Clock, port: BytePort) -> None:
-        self._settings, self._clock, self._port = settings, clock, port
+        self._settings, self._clock, self._port = settings, clock, LatchedPort(port)
         self._name = settings.port or "(in memory)"
         self._byte_ns = 10 * NS_PER_S // settings.baud
         self._lines = LineReader()
@@ -110,7 +111,6 @@ class GrblLens:
         self._implausible = 0
         self._rest_due_ns: int | None = None
         self._stops = self._stops_ignored = 0
-        self._fault: str | None = None
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
         self._trajectory = self._new_trajectory()
@@ -147,7 +147,7 @@ class GrblLens:
 
     def home(self, deadline: HostNs) -> LensReport:
         """Run GRBL's homing cycle (``$H``), return at rest beside the switch."""
-        self._check_fault()
+        self._port.check()
         if self._report is not None and self._report.moving:
             self.stop(StopMode.RAMPED)
             self._await_idle(deadline)
@@ -171,7 +171,7 @@ class GrblLens:
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move; first to standstill, if something else is under way."""
-        self._check_fault()
+        self._port.check()
         check_target(target, self._limits)
         check_speed(speed_sps, self._limits)
         if not self._referenced:
@@ -180,7 +180,7 @@ class GrblLens:
 
     def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
         """Jog towards a limit, or as far as the time until *until* allows; first to standstill, if moving otherwise."""
-        self._check_fault()
+        self._port.check()
         check_speed(velocity_sps, self._limits)
         return self._begin(_Wish(velocity_sps, until_ns=until), "run")
 
@@ -192,7 +192,7 @@ class GrblLens:
         if mode is StopMode.ABRUPT:
             self._resetting = self._locked_by_stop = True
         begun = self._clock.now_ns()
-        self._write(data)
+        self._port.write(data)
         done = self._clock.now_ns()
         with self._lock:
             self._note_stop(mode, begun)
@@ -200,7 +200,7 @@ class GrblLens:
 
     def poll(self) -> LensReport | None:
         """Ask when due, read what has come, take the next step of a reversal; return a new report if there is one."""
-        self._check_fault()
+        self._port.check()
         report = self._poll(fuse=True)
         self._take_next_step()
         return None if report is None else self._flagged(report)
@@ -258,7 +258,7 @@ class GrblLens:
             number = self._trajectory.command(motion, effective, 2 * NS_PER_MS)
             self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 100 * NS_PER_MS
         self._unacknowledged.append(number)
-        self._write(line)
+        self._port.write(line)
         done = self._clock.now_ns()
         self._cruise_sps, self._stopping, self._stops_ignored = wish.speed_sps, False, 0
         if self._stops != stops:
@@ -306,7 +306,7 @@ class GrblLens:
                 )
         lost = self._query_ns is not None and now - self._query_ns > self._settings.reply_ms * NS_PER_MS / 3
         if lost or (self._query_ns is None and now >= self._next_query_ns):
-            self._write(STATUS)
+            self._port.write(STATUS)
             with self._lock:
                 self._sampled_from_ns = self._on_wire(1, now)
             self._query_ns = now
@@ -317,7 +317,7 @@ class GrblLens:
 
     def _take_lines(self, *, fuse: bool) -> LensReport | None:
         """Read and act on every complete line; return the newest report."""
-        data = self._read()
+        data = self._port.read_available()
         before, now = self._read_ns, self._clock.now_ns()
         self._read_ns = now
         newest = None
@@ -352,7 +352,7 @@ class GrblLens:
             if not self._stopping:
                 self._rest_due_ns = (self._trajectory.at_rest_from() or latest) + 100 * NS_PER_MS
         if self._stopping:
-            self._write(CANCEL)  # the first one may have come before there was anything to cancel
+            self._port.write(CANCEL)  # the first one may have come before there was anything to cancel
 
     def _heed(self, line: str) -> None:
         """Act on what the board says by itself."""
@@ -430,7 +430,7 @@ class GrblLens:
         self._stops_ignored += 1
         if self._stops_ignored > 3:
             raise self._trouble(f"the motor still runs after {self._stops_ignored - 1} stops; the board was reset")
-        self._write(CANCEL)
+        self._port.write(CANCEL)
         self._stopping = True
 
     def _flagged(self, report: LensReport) -> LensReport:
@@ -463,7 +463,7 @@ class GrblLens:
         with self._lock:
             self._on_wire(len(line), self._clock.now_ns())
         self._unacknowledged.append(number)
-        self._write(line)
+        self._port.write(line)
 
     def _on_wire(self, count: int, begun: int) -> int:
         """Return when the last of *count* bytes written at *begun* leaves the wire, behind those before it."""
@@ -476,36 +476,8 @@ class GrblLens:
             raise self._trouble(why)
         self._clock.sleep_until(after_ms(now, 1))
 
-    def _write(self, data: bytes) -> None:
-        """Write, or latch that the line is dead."""
-        try:
-            self._port.write(data)
-        except LensError as error:
-            self._latch(str(error))
-            raise
-
-    def _read(self) -> bytes:
-        """Read what has come, or latch that the line is dead."""
-        try:
-            return self._port.read_available()
-        except LensError as error:
-            self._latch(str(error))
-            raise
-
-    def _latch(self, fault: str) -> None:
-        self._fault = self._fault or fault
-        self._referenced = False
-
-    def _check_fault(self) -> None:
-        if self._fault is not None:
-            raise LensError(self._fault)
-
     def _trouble(self, what: str) -> LensError:
         """Reset the board, latch, forget the reference; return what to raise."""
-        try:
-            self._port.write(RESET)
-        except LensError as error:
-            what = f"{what} (and the reset could not be written: {error})"
         self._wish = None
-        self._latch(f"lens: {what}")
-        return LensError(self._fault)
+        self._referenced = False
+        return self._port.trouble(what, RESET, "reset")

@@ -32,6 +32,7 @@ from elpd_drivers.lenses.axis import (
     read_settings,
     run_target,
 )
+from elpd_drivers.lenses.latched import LatchedPort
 from elpd_drivers.lenses.tic_wire import crc7, encode, long_word, parse_reply, reply_length
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class TicLens:
     """``elpd.ports.Lens`` on a Tic. Use ``open_lens``."""
 
     def __init__(self, settings: TicSettings, clock: Clock, port: BytePort) -> None:
-        self._settings, self._clock, self._port = settings, clock, port
+        self._settings, self._clock, self._port = settings, clock, LatchedPort(port)
         self._limits = limits_from(
             settings.um_per_step,
             settings.min_um,
@@ -132,7 +133,6 @@ class TicLens:
         self._rest_due_ns: int | None = None
         self._stops = self._stops_ignored = 0
         self._implausible = 0
-        self._fault: str | None = None
         self._stop_bytes = {
             StopMode.ABRUPT: self._frame(wire.HALT_AND_HOLD),
             StopMode.RAMPED: self._frame(wire.SET_TARGET_VELOCITY, long_word(0)),
@@ -201,7 +201,7 @@ class TicLens:
 
     def home(self, deadline: HostNs) -> LensReport:
         """Run to the reverse limit switch; position 0 is where it lets go."""
-        self._check_fault()
+        self._port.check()
         self._prepare()
         self._referenced = self._halted_softly = False
         self._send(self._frame(wire.EXIT_SAFE_START) + self._frame(wire.GO_HOME, b"\0"))
@@ -231,7 +231,7 @@ class TicLens:
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move."""
         stops = self._stops
-        self._check_fault()
+        self._port.check()
         check_target(target, self._limits)
         check_speed(speed_sps, self._limits)
         if not self._referenced:
@@ -241,7 +241,7 @@ class TicLens:
     def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
         """Run at a signed velocity, ending at *until* or the limit: a target position that says both."""
         stops = self._stops
-        self._check_fault()
+        self._port.check()
         check_speed(velocity_sps, self._limits)
         with self._lock:
             now = self._clock.now_ns()
@@ -256,7 +256,7 @@ class TicLens:
         self._stops += 1
         data = self._stop_bytes[mode]
         begun = self._clock.now_ns()
-        self._write(data)
+        self._port.write(data)
         done = self._clock.now_ns()
         with self._lock:
             effective = self._on_wire(len(data), begun) + self._latency_ns
@@ -273,7 +273,7 @@ class TicLens:
 
     def poll(self) -> LensReport | None:
         """Ask when due, read what has come, return the newest report if there is a new one."""
-        self._check_fault()
+        self._port.check()
         report = self._poll(fuse=True)
         return None if report is None else self._flagged(report)
 
@@ -306,7 +306,7 @@ class TicLens:
         elif self._rest_due_ns is None:
             steps = [(limit, None), (aim, motion)]
         begun = self._clock.now_ns()
-        self._write(b"".join(data for data, _ in steps))
+        self._port.write(b"".join(data for data, _ in steps))
         done = self._clock.now_ns()
         self._speed_sps = speed_sps
         with self._lock:
@@ -333,7 +333,7 @@ class TicLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = None
         now = self._clock.now_ns()
-        self._received += self._read()
+        self._received += self._port.read_available()
         if self._query and len(self._received) >= self._reply_length:
             report = self._parse(now, fuse=fuse)
         if self._unanswered_since_ns is not None:
@@ -347,7 +347,7 @@ class TicLens:
         if lost or (self._query is None and now >= self._next_query_ns):
             self._received.clear()
             begun = self._clock.now_ns()
-            self._write(self._query_bytes)
+            self._port.write(self._query_bytes)
             with self._lock:
                 end = self._on_wire(len(self._query_bytes), begun)
             self._query = _Query(begun, end - (len(self._query_bytes) - self._query_head) * self._byte_ns)
@@ -430,12 +430,12 @@ class TicLens:
             return
         self._stops_ignored += 1
         if self._stops_ignored > 3:
-            self._write(self._frame(wire.DEENERGIZE))
+            self._port.write(self._frame(wire.DEENERGIZE))
             raise self._trouble(
                 f"the motor still runs at {report.velocity_sps or 0.0:.0f} steps/s after "
                 f"{self._stops_ignored - 1} stops; its driver was switched off"
             )
-        self._write(self._stop_bytes[StopMode.ABRUPT])
+        self._port.write(self._stop_bytes[StopMode.ABRUPT])
 
     def _flagged(self, report: LensReport) -> LensReport:
         flags = report.flags
@@ -455,7 +455,7 @@ class TicLens:
 
     def _send(self, data: bytes) -> None:
         begun = self._clock.now_ns()
-        self._write(data)
+        self._port.write(data)
         with self._lock:
             self._on_wire(len(data), begun)
 
@@ -471,7 +471,7 @@ class TicLens:
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
         expected = length + self._settings.crc_responses
         while True:
-            self._received += self._read()
+            self._received += self._port.read_available()
             now = self._clock.now_ns()
             if len(self._received) >= expected:
                 break
@@ -501,35 +501,7 @@ class TicLens:
                 raise self._trouble("no report after connecting; check the cable")
             self._clock.sleep_until(after_ms(now, 0.5))
 
-    def _write(self, data: bytes) -> None:
-        """Write, or latch that the line is dead."""
-        try:
-            self._port.write(data)
-        except LensError as error:
-            self._latch(str(error))
-            raise
-
-    def _read(self) -> bytes:
-        """Read what has come, or latch that the line is dead."""
-        try:
-            return self._port.read_available()
-        except LensError as error:
-            self._latch(str(error))
-            raise
-
-    def _latch(self, fault: str) -> None:
-        self._fault = self._fault or fault
-        self._referenced = False
-
-    def _check_fault(self) -> None:
-        if self._fault is not None:
-            raise LensError(self._fault)
-
     def _trouble(self, what: str) -> LensError:
         """Halt, latch, forget the reference; return what to raise."""
-        try:
-            self._port.write(self._stop_bytes[StopMode.ABRUPT])
-        except LensError as error:
-            what = f"{what} (and the halt could not be written: {error})"
-        self._latch(f"lens: {what}")
-        return LensError(self._fault)
+        self._referenced = False
+        return self._port.trouble(what, self._stop_bytes[StopMode.ABRUPT], "halt")
