@@ -1,7 +1,7 @@
 """Draw a run of `elpd demo`, as README shows it: the ELP curve over the lens position, and the scene before and after.
 
     elpd demo                                                   # names the folder that it recorded
-    python tools/readme_pictures.py RUN docs/images/focus.png
+    python tools/readme_pictures.py RUN tools/docs/images/focus.png
 
 Everything is read from the run's folder. Needs matplotlib (``pip install '.[docs]'``), which nothing else does.
 """

@@ -406,7 +406,7 @@ def widened(roi: Roi, margin_px: int, width: int, height: int) -> Roi:
 
 
 def result_fields(result: FocusResult) -> dict[str, Any]:
-    """Return the stable JSON fields of a result (docs/json.md), with its details beside them."""
+    """Return the stable JSON fields of a result (tools/docs/json.md), with its details beside them."""
     return {
         "outcome": result.outcome.value,
         "reason": result.reason,

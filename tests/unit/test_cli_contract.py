@@ -32,7 +32,7 @@ def _words(text: str) -> set[str]:
     return set(text.split())
 
 
-# The documented fields (docs/json.md). More may be added, none renamed.
+# The documented fields (tools/docs/json.md). More may be added, none renamed.
 DECODE = _words(
     "format width height events on first_us last_us triggers frames imu rate_controller digest lost lost_reason "
     "warnings"
