@@ -35,6 +35,7 @@ from elpd.records import (
 )
 from elpd.units import NS_PER_MS, HostNs, after_ms
 from elpd.vision.choose import propose_roi
+from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.reference import reference_from_frame
 
 if TYPE_CHECKING:
@@ -51,10 +52,6 @@ BIAS_SETTLE_MS = 10.0
 
 FRAME_LIMIT_MS = 500.0
 """A camera with frames delivers one within this, or has none."""
-
-
-ROI_MARGIN_PX = 14
-"""Pixels around the ROI that the sensor keeps on: filters need neighbours, motion needs room."""
 
 
 class Observer(Protocol):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from elpd.errors import UsageError
-from elpd.events.stream import PacketDecoder
 from elpd.focus.safety import CAMERA_SILENCE_MS
 from elpd.ports import Biases, HardwareRoi
 from elpd.records import BiasSet
@@ -20,7 +19,7 @@ from elpd.vision.temporal_map import iris, linear, quality, temporal_image
 
 if TYPE_CHECKING:
     from elpd.focus.stage import Stage
-    from elpd.records import CameraPacket, TemporalImage
+    from elpd.records import TemporalImage
 
 DARK_MS = 15.0
 """Biases settle and noise shows itself before the light comes."""
@@ -51,16 +50,11 @@ def expose(
         camera.apply_biases(BiasSet.EXPOSE)
     stage.wait_ms(DARK_MS)
 
-    decoder = PacketDecoder(camera.geometry)
     stamp = aperture.open()
     first = FirstEventMap(camera.geometry, begin_us=stage.sensor_clock.to_sensor(stamp.begun_ns))
     until = after_ms(stamp.begun_ns, AFTER_FACTOR * aperture.opening_ms + DARK_MS)
 
-    def latch(packet: CameraPacket) -> None:
-        events = decoder.feed(packet)
-        first.add(events.t, events.x, events.y, events.p)
-
-    stage.listener = latch
+    stage.listener = first.add_packet
     try:
         while stage.now_ns() < until:
             stage.read()

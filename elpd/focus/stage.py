@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from elpd.errors import CameraError, LensError
 from elpd.ports import Latency
 from elpd.timebase import SensorClock
-from elpd.units import NS_PER_MS, NS_PER_US, HostNs, SensorUs, Steps, after_ms
+from elpd.units import NS_PER_MS, HostNs, SensorUs, Steps, after_ms
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,7 +41,6 @@ class Stage:
         self.report: LensReport | None = None
         self.packets = 0
         self.lost_events = 0
-        self.gaps = 0
         self.last_packet_ns = parts.clock.now_ns()
         self.listener: Callable[[CameraPacket], object] | None = None
         """Hears every packet that is read while a phase waits."""
@@ -93,7 +92,6 @@ class Stage:
         self.packets += 1
         self.last_packet_ns = packet.received_ns
         self.lost_events += packet.lost_events
-        self.gaps += packet.gap_before
         if packet.complete_until_us is not None:
             self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
         if packet.frames:
@@ -178,7 +176,3 @@ class Stage:
     def elapsed_ms(self, since: HostNs) -> float:
         """Return the milliseconds since an instant."""
         return (self.now_ns() - since) / NS_PER_MS
-
-    def age_us(self, when: SensorUs) -> int:
-        """Return how long ago a sensor time was, in us."""
-        return (self.now_ns() - self.sensor_clock.to_host(when)) // NS_PER_US

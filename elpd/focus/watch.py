@@ -279,7 +279,7 @@ class Watch:
     def estimate(self) -> FocusEstimate | None:
         """Say where focus was, in um on the motor's ruler; ``None`` if no witness saw it.
 
-        Decodes what was kept: milliseconds, after the stop has been sent.
+        Asks the remembered events: milliseconds, after the stop has been sent.
         """
         if self.decided_us is None:
             return None

@@ -174,11 +174,6 @@ class Meter:
         self._sums = np.zeros((1, 4), dtype=np.int64)
         self._last_us = begin_us
 
-    @property
-    def open_since_us(self) -> int:
-        """Where the present window began."""
-        return self._begin_us
-
     def set_reference(self, reference: Reference) -> None:
         """Use another picture from the next event on."""
         self._weights = reference.weights

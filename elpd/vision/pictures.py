@@ -80,15 +80,21 @@ def read_picture(path: Path) -> Picture:
         data = path.read_bytes()
     except OSError as error:
         raise UsageError(f"{path}: cannot be read ({error.strerror})") from None
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if pixels is None:
-        raise FormatError(f"{path}: not a picture that can be decoded; a PNG, JPEG or TIFF was expected")
+    pixels = decode_grey(data, path)
     scale = _log_scale(data)
     if scale is None:
         return Picture(pixels, is_log=False)
     low, step = scale
     return Picture((pixels * step + low).astype(np.float32), is_log=True)
+
+
+def decode_grey(data: bytes, path: Path) -> NDArray[Any]:
+    """Decode an encoded image to grey of 8 or 16 bit. Raises ``FormatError``, naming *path*, if it is none."""
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if pixels is None:
+        raise FormatError(f"{path}: {len(data)} bytes that are no image: not a picture of PNG, JPEG, TIFF or PGM")
+    return np.asarray(pixels)
 
 
 def _log_scale(data: bytes) -> tuple[float, float] | None:

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from elpd.errors import FormatError, UsageError
+from elpd.vision.pictures import decode_grey
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -104,13 +105,10 @@ def reference_from_temporal_image(picture: TemporalImage, roi: Roi) -> Reference
 def load_image(path: Path) -> NDArray[np.generic]:
     """Read a grey image of 8 or 16 bit from PNG, JPEG, TIFF or PGM. Raises ``FormatError``."""
     try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        data = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read ({error.strerror}); give an existing PNG or JPEG image") from None
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
-    if image is None:
-        raise FormatError(f"{path}: {data.size} bytes that are no image; PNG, JPEG, TIFF and PGM are read")
-    return np.asarray(image)
+    return decode_grey(data, path)
 
 
 def full_scale(pixels: NDArray[np.generic]) -> float | None:
