@@ -13,6 +13,7 @@ import numpy as np
 from elpd.cli.common import config_options, json_option, parse_interval_us, parse_roi, print_json
 from elpd.config import load
 from elpd.errors import FormatError, UsageError
+from elpd.focus.picture import Picture
 from elpd.record.journal import is_run
 from elpd.record.layouts import read_sweep
 from elpd.record.paper_sweep import detect_as_published
@@ -21,7 +22,8 @@ from elpd.record.sweep_file import Detection, SweepSearch
 from elpd.records import Direction, Geometry, Outcome
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
-from elpd.vision.reference import check_size, load_image, reference_from_frame, reference_from_temporal_image
+from elpd.vision.pictures import read_picture
+from elpd.vision.reference import check_size, reference_from_temporal_image
 from elpd.vision.ruler import Ruler
 from elpd.vision.temporal_map import quality, read_transmittance, temporal_image
 
@@ -67,8 +69,8 @@ def command(
     ruler = _ruler(speed_um_s, lens_path)
     if dof_um is not None and not dof_um > 0.0:
         raise UsageError(f"--dof-um must be positive; got {dof_um}")
-    pixels = None if reference_path is None else load_image(reference_path)
-    size = None if pixels is None else Geometry(pixels.shape[1], pixels.shape[0])
+    given = None if reference_path is None else read_picture(reference_path)
+    size = None if given is None else Geometry(given.pixels.shape[1], given.pixels.shape[0])
     recorded = read_run_sweep(path) if is_run(path) else None
     if recorded is None:
         sweep = read_sweep(path, frames=frames, size=size)
@@ -99,9 +101,11 @@ def command(
         begin_us = aperture_us[1]
     if recorded is not None:
         begin_us = recorded.begin_us
-    if pixels is not None:
-        check_size(pixels.shape, sweep.geometry, str(reference_path))
-        reference = reference_from_frame(pixels, roi)
+    pixels = None
+    if given is not None:
+        check_size(given.pixels.shape, sweep.geometry, str(reference_path))
+        whole = Picture.of_image(given)
+        picture, pixels, reference = whole.map or picture, whole.pixels, whole.reference(roi)
     if method == "paper":
         found = detect_as_published(sweep, roi, pixels if picture is None else _as_published(picture), begin_us)
         return _finish(found, as_json=as_json)

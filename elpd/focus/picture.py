@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi
+    from elpd.vision.pictures import Picture as GreyPicture
     from elpd.vision.reference import Reference
 
 
@@ -52,6 +53,11 @@ class Picture:
             return cls.of_map(stored)
         image = read_picture(path)
         check_size(image.pixels.shape, geometry, str(path))
+        return cls.of_image(image)
+
+    @classmethod
+    def of_image(cls, image: GreyPicture) -> Picture:
+        """Take what a file held: linear grey, or the log intensity that ``write_log_png`` wrote."""
         if not image.is_log:
             return cls.of_frame(image.pixels)
         log_image = np.ascontiguousarray(image.pixels, np.float32)
