@@ -20,7 +20,7 @@ from elpd.timebase import MonotonicClock
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "tools" / "docs").rglob("*.md"))]
 
 
 def test_the_strangers_camera_works(tmp_path: Path) -> None:
@@ -49,6 +49,10 @@ def test_the_entry_point_names_the_example() -> None:
     assert tomllib.loads(_block("toml", "entry-points"))["project"]["entry-points"]["elpd.cameras"] == {
         "pipe": "pipe_camera:PipeCamera"
     }
+
+
+def test_the_documents_are_found() -> None:
+    assert {page.name for page in PAGES} >= {"README.md", "detection.md", "json.md"}
 
 
 def test_every_command_and_outcome_is_in_readme() -> None:
