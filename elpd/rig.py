@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, DeviceError
 from elpd.ports import Closeable, RigParts
+from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def build(config: Config) -> RigParts:
             {
                 **config.sim.model_dump(),
                 "um_per_step": config.lens.um_per_step,
+                "steps_to_um": config.lens.steps_to_um,
             }
         )
     else:
@@ -85,7 +87,7 @@ def _hardware(config: Config) -> RigParts:
         if isinstance(lens, Closeable):
             lens.close()
         raise
-    return RigParts(clock, camera, lens, aperture, config.lens.um_per_step)
+    return RigParts(clock, camera, lens, aperture, _scale(config.lens))
 
 
 def _with_replacements(parts: RigParts, config: Config) -> RigParts:
@@ -107,8 +109,17 @@ def _open(group: str, section: DeviceSection, clock: Clock) -> EventCamera:
 
 def _open_lens(section: LensSection, clock: Clock) -> Lens:
     settings = {**section.settings(), "um_per_step": section.um_per_step, "max_speed_um_s": section.speed_um_s}
+    scale = _scale(section)
+    if scale.table:  # a driver knows steps of one nominal size: say where the ends are in those
+        for key in ("min_um", "max_um"):
+            if isinstance(settings.get(key), (int, float)):
+                settings[key] = scale.to_steps(settings[key]) * section.um_per_step
     lens: Lens = find("elpd.lenses", section.driver)(settings, clock)
     return lens
+
+
+def _scale(section: LensSection) -> LensScale:
+    return LensScale(section.um_per_step, section.steps_to_um)
 
 
 def _open_aperture(section: DeviceSection, clock: Clock) -> Aperture:
