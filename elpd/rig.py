@@ -7,6 +7,7 @@ clock: a recording as the camera (``camera.driver = "file"``), a lens over a rea
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from elpd.config import Config, DeviceSection, LensSection
     from elpd.ports import Aperture, Clock, EventCamera, Lens
 
@@ -65,6 +68,30 @@ def build(config: Config) -> RigParts:
     else:
         parts = _hardware(config)
     return _with_replacements(parts, config) if config.rig == "sim" else parts
+
+
+@contextmanager
+def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
+    """Open the lens that *config* describes, without a camera, and give it back at the end.
+
+    Raises what ``build`` raises.
+    """
+    if config.rig == "sim":
+        parts = build(config)
+        try:
+            yield parts.clock, parts.lens, parts.scale
+        finally:
+            release(parts)
+        return
+    if config.lens.driver == "sim":
+        raise ConfigError('lens.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    clock = MonotonicClock()
+    lens = _open_lens(config.lens, clock)
+    try:
+        yield clock, lens, _scale(config.lens)
+    finally:
+        if isinstance(lens, Closeable):
+            lens.close()
 
 
 def release(parts: RigParts) -> None:
