@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from elpd_drivers.lenses import avr as avr_driver
 from elpd_drivers.lenses import grbl as grbl_driver
 from elpd_drivers.lenses import tic as tic_driver
+from elpd_drivers.sim.boards.avr import AvrBoard, AvrConfig
 from elpd_drivers.sim.boards.grbl import GrblBoard, GrblConfig
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
 from elpd_drivers.sim.boards.tic import TicBoard, TicConfig
@@ -19,7 +21,13 @@ from elpd.units import HostNs
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-KINDS = ("tic", "grbl")
+KINDS = ("tic", "grbl", "avr")
+DRIVERS = {"tic": tic_driver, "grbl": grbl_driver, "avr": avr_driver}
+BOARDS: dict[str, Any] = {
+    "tic": (TicBoard, TicConfig),
+    "grbl": (GrblBoard, GrblConfig),
+    "avr": (AvrBoard, AvrConfig),
+}
 UM_PER_STEP = 0.3125
 SPEED_SPS = 12_800.0  # 4 mm/s
 
@@ -35,7 +43,7 @@ class Rig:
     reports: list[Any] = field(default_factory=list)
 
     def open(self, **settings: Any) -> Any:
-        driver = tic_driver if self.kind == "tic" else grbl_driver
+        driver = DRIVERS[self.kind]
         if self.kind == "grbl":
             settings = {"trust_position": True, **settings}
         self.lens = driver.open_lens(settings, self.clock, self.port)
@@ -75,7 +83,7 @@ def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool 
     """Make a rig in virtual time; ``open`` connects the driver."""
     clock = TestClock()
     motor = SimulatedLens(start_um=start_um)
-    make, settings = (TicBoard, TicConfig) if kind == "tic" else (GrblBoard, GrblConfig)
+    make, settings = BOARDS[kind]
     board = make(motor, settings(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
     port = MemoryPort(board, clock)
     clock.actors.append(port)
@@ -92,5 +100,5 @@ def open_rig(kind: str, **kwargs: Any) -> Rig:
 def served(kind: str, clock: MonotonicClock, **config: Any) -> tuple[PtyServer, SimulatedLens]:
     """Serve a board on a pty."""
     motor = SimulatedLens(start_um=1000.0)
-    make, settings = (TicBoard, TicConfig) if kind == "tic" else (GrblBoard, GrblConfig)
+    make, settings = BOARDS[kind]
     return PtyServer(make(motor, settings(referenced=True, **config), begin_ns=clock.now_ns())), motor

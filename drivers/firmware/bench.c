@@ -19,7 +19,7 @@
 
 typedef struct {
     uint64_t cycle;
-    int32_t rotor;
+    int32_t way;
 } step_t;
 
 typedef struct {
@@ -32,7 +32,7 @@ typedef struct {
     avr_irq_t *uart_in;
     avr_irq_t *limit_min, *limit_max;
     int32_t rotor, lowest, highest;
-    int upwards, stuck, enabled, iris, sync;
+    int upwards, enabled, iris, sync;
     uint64_t sync_edges, steps_made;
     step_t steps[LOG];
     uint32_t steps_put, steps_got;
@@ -55,12 +55,10 @@ static void on_step(struct avr_irq_t *irq, uint32_t value, void *param) {
         return;
     }
     bench->steps_made++;
-    if (!bench->stuck) {
-        bench->rotor += bench->upwards ? 1 : -1;
-    }
+    bench->rotor += bench->upwards ? 1 : -1;
     step_t *step = &bench->steps[bench->steps_put++ % LOG];
     step->cycle = bench->avr->cycle;
-    step->rotor = bench->rotor;
+    step->way = bench->upwards ? 1 : -1;
     set_limits(bench);
 }
 
@@ -172,6 +170,15 @@ void bench_reset(void *handle) {
     set_limits(bench);
 }
 
+/* Put the motor somewhere else: it slipped, or was turned by hand. */
+void bench_place(void *handle, int32_t rotor) {
+    bench_t *bench = handle;
+    if (rotor != bench->rotor) {
+        bench->rotor = rotor;
+        set_limits(bench);
+    }
+}
+
 /* Run until the cycle count has reached `until`; returns 0, or -1 when the AVR has crashed. */
 int bench_run(void *handle, uint64_t until) {
     bench_t *bench = handle;
@@ -207,13 +214,13 @@ uint32_t bench_sent(void *handle, uint64_t *cycles, uint8_t *bytes, uint32_t roo
 }
 
 /* Copy out the steps made since the last call; returns how many. */
-uint32_t bench_steps(void *handle, uint64_t *cycles, int32_t *rotors, uint32_t room) {
+uint32_t bench_steps(void *handle, uint64_t *cycles, int32_t *ways, uint32_t room) {
     bench_t *bench = handle;
     uint32_t count = 0;
     for (; count < room && bench->steps_got != bench->steps_put; count++) {
         step_t *step = &bench->steps[bench->steps_got++ % LOG];
         cycles[count] = step->cycle;
-        rotors[count] = step->rotor;
+        ways[count] = step->way;
     }
     return count;
 }
@@ -223,4 +230,3 @@ uint64_t bench_steps_made(void *handle) { return ((bench_t *)handle)->steps_made
 uint64_t bench_sync_edges(void *handle) { return ((bench_t *)handle)->sync_edges; }
 int bench_iris(void *handle) { return ((bench_t *)handle)->iris; }
 int bench_enabled(void *handle) { return ((bench_t *)handle)->enabled; }
-void bench_stick(void *handle, int stuck) { ((bench_t *)handle)->stuck = stuck; }

@@ -4,7 +4,13 @@
  * steps. The ramp is the one of D. Austin, "Generate stepper-motor speed profiles in real time" (Embedded Systems
  * Programming, 2005): with n the number of steps that a ramp from rest has taken, the next interval is
  *
- *     c[n] = c[n-1] - 2 c[n-1] / (4 n + 1),      c[0] = 0.676 f sqrt(2 / a)
+ *     c[n] = c[n-1] - 2 c[n-1] / (4 n + 1),      c[0] = 0.676 f sqrt(2 / a),
+ *
+ * back the same way,
+ *
+ *     c[n-1] = c[n] + 2 c[n] / (4 n - 1)
+ *
+ * (0.676 makes up for what the series loses at its beginning; the first and the last step take the true f sqrt(2 / a)),
  *
  * and n is at the same time how many steps it takes to stop. So a motion brakes when n reaches what is left, and ends on
  * its target exactly. Everything is one motion: towards `bound`, at most at `cruise`; a new target behind is reached by
@@ -48,7 +54,8 @@ static uint8_t fraction;
 static uint16_t sync_left;
 
 /* Settings; written only at rest. */
-static uint32_t first_interval;
+static uint32_t rest_interval; /* from rest to the first step, and from the last to rest: f sqrt(2 / a) */
+static uint32_t ramp_interval; /* c[0], what the ramp begins to count from */
 static uint16_t max_speed = 1000;
 static int32_t soft_min = INT32_MIN / 2;
 static int32_t soft_max = INT32_MAX / 2;
@@ -78,12 +85,12 @@ static uint32_t ticks_now(void) {
     return now;
 }
 
-/* What a ramp's n-th step adds to or takes from an interval. The compiler's 24-bit division takes 22 us, the 32-bit one 40. */
-static uint32_t change(uint32_t of, uint32_t n) {
-    if (of < 1ul << 22 && n < 1ul << 21) {
-        return (__uint24)(2 * of) / (__uint24)(4 * n + 1);
+/* 2 c / d, by which a ramp's step changes an interval. The compiler's 24-bit division takes 22 us, the 32-bit one 40. */
+static uint32_t change(uint32_t of, uint32_t divisor) {
+    if (of < 1ul << 22 && divisor < 1ul << 23) {
+        return (__uint24)(2 * of) / (__uint24)divisor;
     }
-    return 2 * of / (4 * n + 1);
+    return 2 * of / divisor;
 }
 
 static uint32_t interval_of(uint16_t speed) { return (TICK_HZ << FRACTION) / speed; }
@@ -108,7 +115,7 @@ static void start(int8_t way) {
     } else {
         PORTB &= (uint8_t)~(1u << DIR_BIT);
     }
-    interval = first_interval > cruise ? first_interval : cruise;
+    interval = rest_interval > cruise ? rest_interval : cruise;
     ramp = 0;
     fraction = 0;
     moving = true;
@@ -152,23 +159,27 @@ ISR(TIMER1_COMPA_vect) {
     int32_t ahead = (bound - position) * direction;
     bool stop = braking || ahead <= (int32_t)ramp;
     uint32_t next = interval;
+    bool over = false;
     if (stop) {
-        if (ramp <= 1) {
-            ramp = 0;
+        if (ramp == 0) {
+            over = true;
         } else {
+            next = ramp == 1 ? rest_interval : next + change(next, 4 * ramp - 1);
             ramp--;
-            next += change(next, ramp);
         }
     } else if (next > cruise) {
+        if (ramp == 0) {
+            next = ramp_interval;
+        }
         ramp++;
-        next -= change(next, ramp);
+        next -= change(next, 4 * ramp + 1);
         if (next < cruise) {
             next = cruise;
         }
     } else if (next < cruise) {
         if (ramp > 1) {
+            next += change(next, 4 * ramp - 1);
             ramp--;
-            next += change(next, ramp);
         }
         if (next > cruise || ramp <= 1) {
             next = cruise;
@@ -180,14 +191,9 @@ ISR(TIMER1_COMPA_vect) {
         return;
     }
     interval = next;
-    if (stop && ramp == 0) {
+    if (over) {
         if (braking || position == bound) {
             rest();
-        } else if (ahead > 0) { /* crawl the last steps */
-            uint16_t sum = (uint16_t)(interval & 0xFFu) + fraction;
-            fraction = (uint8_t)sum;
-            schedule((interval >> FRACTION) + (sum >> FRACTION));
-            TIMSK1 |= 1u << OCIE1A;
         } else {
             start((int8_t)-direction);
         }
@@ -234,7 +240,9 @@ bool motion_configure(uint32_t acceleration, uint16_t speed, int32_t min, int32_
     if (moving || homing != HOMING_NOT) {
         return false;
     }
-    first_interval = (uint32_t)(0.676 * TICK_HZ * sqrt(2.0 / (double)acceleration) * (1 << FRACTION));
+    double from_rest = TICK_HZ * sqrt(2.0 / (double)acceleration) * (1 << FRACTION);
+    rest_interval = (uint32_t)from_rest;
+    ramp_interval = (uint32_t)(0.676 * from_rest);
     max_speed = speed;
     soft_min = min;
     soft_max = max;

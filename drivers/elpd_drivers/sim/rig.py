@@ -61,8 +61,8 @@ class SimSettings:
     pictures by seed. ``speed_um_s`` is what the sweep is meant to run at; the lens allows three times as much.
     ``width`` and ``height`` shrink the sensor; 0 is the camera's own size. Rates are per pixel; ``brightness`` scales
     the light, and with it photoreceptor lag and shot noise. The ``camera_*``, ``drop_*`` and ``aperture_stuck`` or
-    ``_slow`` keys inject faults, in seconds after the camera's start. ``cam`` makes the image move by 1 ± that many times
-    as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that the rig's owner believes in.
+    ``_slow`` keys inject faults, in seconds after the camera's start. ``cam`` makes the image move by 1 ± that many
+    times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner believes in.
     """
 
     seed: int = 0
