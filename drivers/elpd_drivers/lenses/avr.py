@@ -110,7 +110,8 @@ class AvrController:
         self.asking = Asking(settings.query_ms, settings.reply_ms)
         self.stop_bytes: Mapping[StopMode, bytes] = {StopMode.ABRUPT: wire.HALT, StopMode.RAMPED: wire.BRAKE}
         self.last_resort = wire.encode(0, wire.ENABLE, b"\0")
-        self.command_ns = len(wire.encode(0, wire.GO, wire.go(0, 1000.0))) * line.byte_ns
+        # the frame, and the half millisecond that a rotor takes for the last, slow step
+        self.command_ns = len(wire.encode(0, wire.GO, wire.go(0, 1000.0))) * line.byte_ns + NS_PER_MS
         self._frames = wire.Frames()
         self._sequence = 0
         self._asked = -1
