@@ -110,6 +110,8 @@ bool link_receive(frame_t *frame) {
     return true;
 }
 
+bool link_waiting(void) { return ready || overrun; }
+
 bool link_overrun(void) {
     bool was;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {

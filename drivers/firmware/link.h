@@ -16,6 +16,7 @@ typedef struct {
 
 void link_init(void);
 bool link_receive(frame_t *frame); /* true: a frame has come */
+bool link_waiting(void);           /* something for the main loop to do */
 bool link_overrun(void);           /* true once after a frame was lost because another waited */
 void link_send(const uint8_t *body, uint8_t length);
 

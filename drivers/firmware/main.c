@@ -1,6 +1,7 @@
 /* An open lens controller: says what it does, does what it is told, stops when nobody speaks. See README.md. */
 #include <avr/interrupt.h>
 #include <avr/io.h>
+#include <avr/sleep.h>
 #include <avr/wdt.h>
 #include <string.h>
 
@@ -102,6 +103,18 @@ static void reply(uint8_t sequence, uint8_t command, uint8_t status) {
     link_send(body, (uint8_t)(at - body));
 }
 
+/* Sleep (idle, which is what SMCR says after a reset) until an interrupt, unless one has already left something to do: the check and the sleep are one. */
+static void idle(void) {
+    cli();
+    if (!link_waiting()) {
+        sleep_enable();
+        sei();
+        sleep_cpu();
+        sleep_disable();
+    }
+    sei();
+}
+
 int main(void) {
     MCUSR = 0;
     wdt_enable(WDTO_120MS);
@@ -117,6 +130,7 @@ int main(void) {
             reply(0, 0, STATUS_OVERRUN);
         }
         if (!link_receive(&frame)) {
+            idle();
             continue;
         }
         if (!frame.intact) {

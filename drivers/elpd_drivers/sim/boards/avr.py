@@ -88,6 +88,8 @@ class AvrBoard:
         self._now_ns = begin_ns
         self._boot_ns = float(begin_ns)
         self._stepped_ns = begin_ns
+        self._pins = rotor
+        self._goal: float | None = None
         self._power_up(begin_ns, rotor if self.config.referenced else None)
 
     def __del__(self) -> None:
@@ -134,6 +136,16 @@ class AvrBoard:
         return int(self._bench.bench_steps_made(self._handle))
 
     @property
+    def pin_position(self) -> int:
+        """Where the motor must be by the edges on STEP and the level of DIR, in steps since it was told where it is."""
+        return self._pins
+
+    @property
+    def last_step_ns(self) -> int:
+        """When STEP rose last."""
+        return self._stepped_ns
+
+    @property
     def sync_edges(self) -> int:
         """How many edges SYNC has had."""
         return int(self._bench.bench_sync_edges(self._handle))
@@ -167,13 +179,12 @@ class AvrBoard:
             at_ns = max(self._time_of(self._cycles[index]), self._stepped_ns)
             interval_s = min(max((at_ns - self._stepped_ns) / NS_PER_S, 1e-6), LONGEST_STEP_S)
             self._stepped_ns = at_ns
+            self._pins += self._ways[index]
             target = self._target(at_ns) + self._ways[index]
             gap = target - self.lens.pulses_at(at_ns)
             self.lens.follow(at_ns, (Piece(interval_s, gap / interval_s, 0.0), Piece(float("inf"), 0.0, 0.0)))
             self._goal = target
         self._bench.bench_place(self._handle, round(self.lens.rotor_at(self._now_ns)))
-
-    _goal: float | None = None
 
     def _target(self, at_ns: int) -> float:
         """Return the step that the rotor is on, or on its way to."""
@@ -226,8 +237,9 @@ def built() -> tuple[Path, Path]:
 def _run(command: list[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  (our own words)
     if done.returncode:
-        last = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["no message"]
-        raise LensError(f"{command[0]} failed to build the firmware: {last[0]}; apt-get install make gcc {PACKAGES}")
+        said = (done.stderr or done.stdout).strip().splitlines()
+        first = next((line for line in said if "error" in line), said[-1] if said else "no message")
+        raise LensError(f"{command[0]} failed to build the firmware: {first}; apt-get install make gcc {PACKAGES}")
 
 
 @cache
