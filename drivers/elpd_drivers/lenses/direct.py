@@ -321,7 +321,7 @@ class DirectLens:
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Around everything that can meet trouble: the halt goes out, the fault stays, the reference is gone."""
-        with self._line.stopping_on_trouble(self._controller.stop_bytes[StopMode.ABRUPT], "halt"):
+        with self._line.stopping_on_trouble(lambda: self._controller.stop_bytes[StopMode.ABRUPT], "halt"):
             try:
                 yield
             except Trouble:
