@@ -188,6 +188,13 @@ class GrblBoard:
         self._state = "Alarm" if self.settings[22] else "Idle"
         self._say_hello(at_ns + 500 * NS_PER_MS)
 
+    def alarm_at(self, at_ns: int) -> None:
+        """Let a limit switch be pressed at *at_ns*: the pulses stop, and the board says no more until it is reset."""
+        self.advance_to(at_ns)
+        self.lens.halt(at_ns)
+        self._alarm(1, at_ns)
+        self._silent = True
+
     def _lines_wait(self) -> bool:
         """Say whether the main loop is elsewhere: homing, suspended by a hold or cancel, or dead after an alarm."""
         cancelling = self._motion is not None and self._motion.holding

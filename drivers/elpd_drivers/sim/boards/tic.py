@@ -165,6 +165,13 @@ class TicBoard:
         self._agenda.clear()
         self._power_up(at_ns, referenced=False)
 
+    def alarm_at(self, at_ns: int) -> None:
+        """Let the motor driver fail at *at_ns*: coils off, position unknown; it works again after the next command."""
+        self.advance_to(at_ns)
+        self._raise_errors(TicError.DRIVER, at_ns)
+        self._halt(at_ns)
+        self._uncertain = True
+
     # --- framing ---------------------------------------------------------------------------------------------------
 
     def _frame_complete(self, at_ns: int) -> None:
