@@ -11,7 +11,7 @@ What differs between such controllers is their wire protocol and the truth about
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from elpd.errors import LensError
@@ -84,6 +84,11 @@ class Controller(Protocol):
     command_ns: int
 
     @property
+    def trouble_bytes(self) -> bytes:
+        """What to send when something went wrong: the hardest stop, and that the position is not to be trusted."""
+        ...
+
+    @property
     def limits(self) -> LensLimits:
         """Travel and speed; final once connected."""
         ...
@@ -153,6 +158,7 @@ class DirectLens:
         self._controller, self._line, self._motor = controller, line, motor
         self._clock, self._latency, self._poll_ms = clock, latency, poll_ms
         self._limit = False
+        self._obeyed_ns = 0
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -260,6 +266,7 @@ class DirectLens:
         with self._guarded():
             going = self._controller.go(target, speed_sps)
             for off_wire_ns, motion in going.steps:
+                self._obeyed_ns = off_wire_ns + self._latency.usual_ns + 3 * self._latency.sigma_ns
                 self._motor.command(motion, off_wire_ns + self._latency.usual_ns, self._latency.sigma_ns)
             self._motor.stops_ignored = 0
             if self._motor.stops != stops:
@@ -281,6 +288,8 @@ class DirectLens:
         flags = LensFlag.MOVING if reading.moving else LensFlag.NONE
         latest = max(reading.latest_ns, reading.earliest_ns)
         report = LensReport(reading.steps, HostNs(reading.earliest_ns), HostNs(latest), reading.velocity_sps, flags)
+        if reading.restart and reading.earliest_ns < self._obeyed_ns:
+            reading = replace(reading, restart=False)  # it was so before the last command
         if fuse:
             if reading.restart:
                 self._motor.begin(report)
@@ -321,7 +330,7 @@ class DirectLens:
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Around everything that can meet trouble: the halt goes out, the fault stays, the reference is gone."""
-        with self._line.stopping_on_trouble(self._controller.stop_bytes[StopMode.ABRUPT], "halt"):
+        with self._line.stopping_on_trouble(lambda: self._controller.trouble_bytes, "halt"):
             try:
                 yield
             except Trouble:

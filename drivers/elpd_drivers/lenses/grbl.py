@@ -392,7 +392,7 @@ class GrblLens:
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Around everything that can meet trouble: the reset goes out, the fault stays, the reference is gone."""
-        with self._line.stopping_on_trouble(RESET, "reset"):
+        with self._line.stopping_on_trouble(lambda: RESET, "reset"):
             try:
                 yield
             except Trouble:

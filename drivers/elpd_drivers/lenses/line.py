@@ -91,15 +91,15 @@ class Line:
             raise LensError(self._fault)
 
     @contextmanager
-    def stopping_on_trouble(self, strongest: bytes, name: str) -> Iterator[None]:
-        """Turn ``Trouble`` into a latched ``LensError``, behind the *strongest* stop (called *name*)."""
+    def stopping_on_trouble(self, strongest: Callable[[], bytes], name: str) -> Iterator[None]:
+        """Turn ``Trouble`` into a latched ``LensError``, behind the *strongest* stop there is (called *name*)."""
         self.check()
         try:
             yield
         except Trouble as trouble:
             what = str(trouble)
             try:
-                self._port.write(strongest)
+                self._port.write(strongest())
             except LensError as error:
                 what = f"{what} (and the {name} could not be written: {error})"
             self._latch(f"lens: {what}")

@@ -43,6 +43,7 @@ class Motor:
         self.referenced = False
         self.rest_due_ns: int | None = None
         self.report: LensReport | None = None
+        self.newest_command = 0
         self.stops = 0
         self.stops_ignored = 0
         self._grace_ns = round(grace_ms * NS_PER_MS)
@@ -85,9 +86,9 @@ class Motor:
     def command(self, motion: Motion, effective_ns: int, sigma_ns: float, *, grace_ms: float | None = None) -> int:
         """Note a command that takes effect at *effective_ns*; return the number to amend it by."""
         with self._lock:
-            number = self._trajectory.command(motion, effective_ns, sigma_ns)
+            self.newest_command = self._trajectory.command(motion, effective_ns, sigma_ns)
             self._expect_rest(effective_ns, grace_ms)
-            return number
+            return self.newest_command
 
     def amend(self, number: int, effective_ns: int, sigma_ns: float, *, still_ending: bool = True) -> None:
         """Learn when command *number* truly took effect, and with it (if *still_ending*) when it is over."""

@@ -115,6 +115,11 @@ class TicController:
         self._speed_sps = 0.0
 
     @property
+    def trouble_bytes(self) -> bytes:
+        """A halt; with it the Tic itself says that the position is uncertain."""
+        return self.stop_bytes[StopMode.ABRUPT]
+
+    @property
     def capabilities(self) -> LensCapabilities:
         """True velocity, a halt at once, a dead-man in the board."""
         return LensCapabilities(

@@ -21,13 +21,10 @@ from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
 from elpd.records import Encoding, Geometry, Roi
 from elpd.scale import LensScale
-from elpd_drivers.lenses import grbl, tic
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
-from elpd_drivers.sim.boards.grbl import GrblBoard, GrblConfig
-from elpd_drivers.sim.boards.line import MemoryPort
-from elpd_drivers.sim.boards.tic import TicBoard, TicConfig
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, SimulatedCamera, Wire
+from elpd_drivers.sim.controllers import Wanted, controller, fitted
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from elpd_drivers.sim.motion import SceneMotion
 from elpd_drivers.sim.optics import DefocusStack, LightField
@@ -43,6 +40,7 @@ if TYPE_CHECKING:
 
     from elpd.ports import Lens
     from elpd.records import FocusResult
+    from elpd_drivers.sim.boards.line import MemoryPort
     from elpd_drivers.sim.sensor import Events
 
 MARGIN_PX = 32
@@ -50,7 +48,6 @@ INTERPOLATION_PX = 3
 ROOM_UM = 300.0
 CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
 MASK_SLOTS = {"evk4": 64, "davis346": 8}
-BOARDS = ("tic", "grbl")
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,24 +306,10 @@ def _mechanics(chosen: SimSettings) -> LensMechanics:
 
 
 def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[Lens, MemoryPort]:
-    speed_um_s, acceleration_um_s2 = 3 * chosen.speed_um_s, chosen.acceleration_um_s2
-    born_ns = world.now_ns()
-    if chosen.board == "grbl":
-        setup = GrblConfig(speed_um_s=speed_um_s, acceleration_um_s2=acceleration_um_s2, referenced=True)
-        port = MemoryPort(GrblBoard(mechanism, setup, seed=chosen.seed, begin_ns=born_ns), world)
-        world.add(port)
-        return grbl.open_lens({"um_per_step": chosen.um_per_step, "trust_position": True}, world, port), port
-    if chosen.board != "tic":
-        raise ConfigError(f"sim.board is {chosen.board!r}; known: {', '.join(BOARDS)}")
-    port = MemoryPort(TicBoard(mechanism, TicConfig(referenced=True), seed=chosen.seed, begin_ns=born_ns), world)
+    wanted = Wanted(chosen.um_per_step, chosen.travel_um, 3 * chosen.speed_um_s, chosen.acceleration_um_s2)
+    port, table = fitted(chosen.board, mechanism, wanted, world, seed=chosen.seed)
     world.add(port)
-    table = {
-        "um_per_step": chosen.um_per_step,
-        "max_um": chosen.travel_um,
-        "max_speed_um_s": speed_um_s,
-        "acceleration_um_s2": acceleration_um_s2,
-    }
-    return tic.open_lens(table, world, port), port
+    return controller(chosen.board).open_lens(table, world, port), port
 
 
 def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
