@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 IDENTIFICATIONS = 3
 """How often to ask who is there, before what answers counts as no Tic."""
 
+LOOK_AHEAD_NS = 2 * NS_PER_MS
+"""What a question and its answer take on the wire, and a little."""
+
 
 @dataclass(frozen=True, slots=True)
 class TicSettings:
@@ -131,6 +134,8 @@ class TicLens:
         self._halted_softly = False
         self._speed_sps = 0.0
         self._rest_due_ns: int | None = None
+        self._rest_from_ns = 0
+        self._look_ns: int | None = None
         self._stops = self._stops_ignored = 0
         self._implausible = 0
         self._stop_bytes = {
@@ -265,10 +270,9 @@ class TicLens:
                 speed = abs(self._trajectory.velocity_at(HostNs(effective)))
                 if mode is StopMode.ABRUPT:
                     safe = speed * self._settings.um_per_step <= self._settings.start_stop_um_s
-                    self._halted_softly = self._referenced and safe
+                    self._halted_softly = self._referenced = self._referenced and safe
                 self._trajectory.command(motion, effective, self._sigma_ns)
-                rest = self._trajectory.at_rest_from() or effective
-                self._rest_due_ns = max(rest, effective) + 20 * NS_PER_MS
+                self._expect_rest(effective, 20 * NS_PER_MS)
         return CommandStamp(f"stop {mode.name.lower()}", begun, done)
 
     def poll(self) -> LensReport | None:
@@ -314,12 +318,17 @@ class TicLens:
                 effective = self._on_wire(len(data), begun) + self._latency_ns
                 if planned is not None:
                     self._trajectory.command(planned, effective, self._sigma_ns)
-            self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 50 * NS_PER_MS
-            self._halted_softly = False
+            self._expect_rest(effective, 50 * NS_PER_MS)
             self._stops_ignored = 0
         if self._stops != stops:
             self.stop(StopMode.ABRUPT)  # one came from another thread while this was on its way: it wins
         return CommandStamp(name, begun, done)
+
+    def _expect_rest(self, effective: int, grace_ns: int) -> None:
+        """Note when the motion ends by the model, when to look whether it has, and when it must have."""
+        self._rest_from_ns = max(self._trajectory.at_rest_from() or effective, effective)
+        self._look_ns = self._rest_from_ns + 3 * self._sigma_ns
+        self._rest_due_ns = self._rest_from_ns + grace_ns
 
     def _prepare(self) -> None:
         """Clear what keeps an idle Tic from moving: its command timeout and the safe start that follows."""
@@ -344,7 +353,7 @@ class TicLens:
                     "and the CRC settings, or raise lens.reply_ms"
                 )
         lost = self._query is not None and now - self._query.sent_ns > self._settings.reply_ms * NS_PER_MS / 4
-        if lost or (self._query is None and now >= self._next_query_ns):
+        if lost or (self._query is None and self._due(now)):
             self._received.clear()
             begun = self._clock.now_ns()
             self._port.write(self._query_bytes)
@@ -355,6 +364,15 @@ class TicLens:
             if self._unanswered_since_ns is None:
                 self._unanswered_since_ns = begun
         return report
+
+    def _due(self, now: int) -> bool:
+        """Ask at regular intervals, and as soon as the motor should rest: then somebody waits for the answer."""
+        if self._look_ns is None or self._look_ns - now > LOOK_AHEAD_NS:
+            return now >= self._next_query_ns
+        if now < self._look_ns:
+            return False  # an answer from before the rest would only keep the line from the one after it
+        self._look_ns = None
+        return True
 
     def _parse(self, now: int, *, fuse: bool) -> LensReport | None:
         query, self._query = self._query, None
@@ -413,11 +431,7 @@ class TicLens:
         if not self._halted_softly:
             self._referenced = self._referenced and self._rest_due_ns is not None and report.moving
             return
-        if (
-            not report.moving
-            and self._rest_due_ns is not None
-            and report.earliest_ns > self._rest_due_ns - 20 * NS_PER_MS
-        ):
+        if not report.moving and report.earliest_ns > self._rest_from_ns:
             self._send(self._frame(wire.HALT_AND_SET_POSITION, long_word(position)))
             self._halted_softly = False
 
