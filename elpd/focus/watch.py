@@ -61,10 +61,6 @@ LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
 
-FAR_DROP = 0.2
-"""Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
-answers are worth the few micrometres."""
-
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
 
@@ -224,7 +220,7 @@ class Watch:
                 continue
             self._detector.feed(sample)
             seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
+            if seen and not self._passed and self._memory.peak_passed:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples

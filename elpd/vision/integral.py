@@ -34,37 +34,69 @@ MISMATCH = 0.15
 _BAND_RATIO = 1.6
 
 
-def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
-    """Return the weighted mean square of one band of *image*, leaving *margin* pixels at each side out of the mean.
+def inside_margin(shape: tuple[int, int], margin: int) -> tuple[slice, slice]:
+    """Return what a margin of *margin* pixels at each side leaves of an image.
 
     Of a small image less is left out: at least its middle eight pixels are measured.
     """
-    margin = max(0, min(margin, (min(image.shape) - 8) // 2))
-    inner = cv2.GaussianBlur(image, (0, 0), scale_px)
-    inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
-    inside = slice(margin, -margin or None)
-    square = np.square(inner[inside, inside])
-    square *= weight[inside, inside]
+    margin = max(0, min(margin, (min(shape) - 8) // 2))
+    return slice(margin, -margin or None), slice(margin, -margin or None)
+
+
+def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
+    """Return the weighted mean square of one band of *image*, leaving a margin out of the mean (``inside_margin``)."""
+    inside = inside_margin((image.shape[0], image.shape[1]), margin)
+    square = np.square(_band(image, scale_px)[inside])
+    square *= weight[inside]
     return float(square.mean(dtype=np.float64))
 
 
-def band_gain(scale_px: float) -> float:
-    """Return the variance that white noise of unit variance has in a band: the sum of the kernel's squares."""
+def band_stamp(scale_px: float) -> NDArray[np.float32]:
+    """Return a band's impulse response, square and of odd size."""
     impulse = np.zeros((33, 33), dtype=np.float32)
     impulse[16, 16] = 1.0
-    return band_energy(impulse, scale_px, np.ones_like(impulse)) * impulse.size
+    response = _band(impulse, scale_px)
+    reach = int(np.abs(np.flatnonzero(response[16]) - 16).max())
+    return np.ascontiguousarray(response[16 - reach : 17 + reach, 16 - reach : 17 + reach])
 
 
-@kernel("void(uint16[::1], uint16[::1], uint8[::1], int32[:, ::1])")
-def add_events(
+def band_gain(scale_px: float) -> float:
+    """Return the variance that white noise of unit variance has in a band: the sum of the response's squares."""
+    return float(np.square(band_stamp(scale_px), dtype=np.float64).sum())
+
+
+def _band(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
+    band = cv2.GaussianBlur(image, (0, 0), scale_px)
+    band -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
+    return np.asarray(band, dtype=np.float32)
+
+
+@kernel("void(uint16[::1], uint16[::1], uint8[::1], float32[:, ::1], float32[:, ::1])")
+def stamp_events(
     x: NDArray[np.uint16],
     y: NDArray[np.uint16],
     on: NDArray[np.uint8],
-    level: NDArray[np.int32],
+    stamp: NDArray[np.float32],
+    band: NDArray[np.float32],
 ) -> None:
-    """Add ±1 per event to *level*, (height, width), in place."""
+    """Add *stamp* around the pixel of each ON event to *band*, (height, width), and subtract it for each OFF event.
+
+    What falls outside is lost.
+    """
+    height, width = band.shape
+    size = stamp.shape[0]
+    reach = size // 2
     for i in range(x.size):
-        level[y[i], x[i]] += 2 * np.int32(on[i]) - 1
+        sign = np.float32(1.0) if on[i] else np.float32(-1.0)
+        left = np.int64(x[i]) - reach
+        top = np.int64(y[i]) - reach
+        begin = max(0, -left)
+        end = min(size, width - left)
+        for row in range(max(0, -top), min(size, height - top)):
+            target = band[top + row, left + begin : left + end]
+            source = stamp[row, begin:end]
+            for column in range(target.size):
+                target[column] += sign * source[column]
 
 
 @kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
