@@ -46,7 +46,7 @@ def inside_margin(shape: tuple[int, int], margin: int) -> tuple[slice, slice]:
 def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
     """Return the weighted mean square of one band of *image*, leaving a margin out of the mean (``inside_margin``)."""
     inside = inside_margin((image.shape[0], image.shape[1]), margin)
-    square = np.square(_band(image, scale_px)[inside])
+    square = np.square(band_image(image, scale_px)[inside])
     square *= weight[inside]
     return float(square.mean(dtype=np.float64))
 
@@ -55,7 +55,7 @@ def band_stamp(scale_px: float) -> NDArray[np.float32]:
     """Return a band's impulse response, square and of odd size."""
     impulse = np.zeros((33, 33), dtype=np.float32)
     impulse[16, 16] = 1.0
-    response = _band(impulse, scale_px)
+    response = band_image(impulse, scale_px)
     reach = int(np.abs(np.flatnonzero(response[16]) - 16).max())
     return np.ascontiguousarray(response[16 - reach : 17 + reach, 16 - reach : 17 + reach])
 
@@ -65,7 +65,7 @@ def band_gain(scale_px: float) -> float:
     return float(np.square(band_stamp(scale_px), dtype=np.float64).sum())
 
 
-def _band(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
+def band_image(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
     band = cv2.GaussianBlur(image, (0, 0), scale_px)
     band -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
     return np.asarray(band, dtype=np.float32)
@@ -99,10 +99,9 @@ def stamp_events(
                 target[column] += sign * source[column]
 
 
-@kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
+@kernel("void(int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
 def rebuild_levels(
     starts: NDArray[np.int64],
-    order: NDArray[np.int64],
     position: NDArray[np.float64],
     on: NDArray[np.uint8],
     ticks: NDArray[np.float64],
@@ -113,10 +112,10 @@ def rebuild_levels(
 
     Parameters
     ----------
-    starts, order:
-        Events of pixel ``k`` in time order are ``order[starts[k] : starts[k + 1]]``.
+    starts:
+        Events of pixel ``k``, in time order, are ``starts[k] : starts[k + 1]``.
     position, on:
-        Lens position (rising with time) and polarity of each event.
+        Lens position (rising with time) and polarity of each event, grouped by pixel (``group_by_pixel``).
     ticks:
         Positions at which the levels are wanted, rising.
     level:
@@ -133,24 +132,20 @@ def rebuild_levels(
         at = -1e300  # where the last knot lies; before the first event the level is constant
         n_on = 0
         n_off = 0
-        for j in range(begin, end):
-            i = order[j]
+        for i in range(begin, end):
             here = position[i]
             step = 1.0 if on[i] else -1.0
-            if j == begin:
+            if i == begin:
                 while tick < n_ticks and ticks[tick] < here:
                     level[tick, k] = value
                     tick += 1
             else:
-                previous = order[j - 1]
-                last = position[previous]
-                if on[previous] != on[i]:
+                last = position[i - 1]
+                if on[i - 1] != on[i]:
                     # The turn: the level of the last event is met again on the way back.
                     mirrored = 0.5 * (last + here)
-                    if j - 2 >= begin:
-                        earlier = order[j - 2]
-                        if on[earlier] == on[previous]:
-                            mirrored = max(here - (last - position[earlier]), mirrored)
+                    if i - 2 >= begin and on[i - 2] == on[i - 1]:
+                        mirrored = max(here - (last - position[i - 2]), mirrored)
                     at = mirrored
                 else:
                     at = last
@@ -194,10 +189,32 @@ class Vertex:
 
 def group_by_pixel(pixel: NDArray[np.int64], pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return (starts, order): a stable sort of event indices by pixel."""
-    order = np.argsort(pixel, kind="stable").astype(np.int64)
     starts = np.zeros(pixels + 1, dtype=np.int64)
-    np.cumsum(np.bincount(pixel, minlength=pixels), out=starts[1:])
+    order = np.empty(pixel.size, dtype=np.int64)
+    sort_by_pixel(pixel, starts, order)
     return starts, order
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1])")
+def sort_by_pixel(pixel: NDArray[np.int64], starts: NDArray[np.int64], order: NDArray[np.int64]) -> None:
+    """Sort event indices by pixel, stably, by counting.
+
+    *starts*, (pixels + 1), begins as zeros; afterwards the events of pixel ``k`` are
+    ``order[starts[k] : starts[k + 1]]``.
+    """
+    for i in range(pixel.size):
+        starts[pixel[i]] += 1
+    behind = 0
+    for k in range(starts.size):
+        count = starts[k]
+        starts[k] = behind
+        behind += count
+    for i in range(pixel.size):
+        order[starts[pixel[i]]] = i
+        starts[pixel[i]] += 1
+    for k in range(starts.size - 1, 0, -1):
+        starts[k] = starts[k - 1]
+    starts[0] = 0
 
 
 def fit_vertex(position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float) -> Vertex | None:

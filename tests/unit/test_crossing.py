@@ -32,7 +32,7 @@ def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
     starts, order = group_by_pixel(pixel, 3)
     level = np.zeros((17, 3), np.float32)
     squares = np.zeros((17, 2))
-    rebuild_levels(starts, order, position, on, ticks, level, squares)
+    rebuild_levels(starts, position[order], on[order], ticks, level, squares)
     for k in range(3):
         events = [(float(z), bool(p)) for z, p, one in zip(position, on, pixel, strict=True) if one == k]
         expected = [naive_vision.level_at(events, tick) if events else 0.0 for tick in ticks]
@@ -42,6 +42,13 @@ def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
         for tick in ticks
     ]
     np.testing.assert_array_equal(squares, counted)
+
+
+@given(st.lists(st.integers(0, 6), max_size=60))
+def test_events_are_grouped_by_pixel_in_their_order(pixels: Any) -> None:
+    starts, order = group_by_pixel(np.array(pixels, np.int64), 7)
+    for k in range(7):
+        assert order[starts[k] : starts[k + 1]].tolist() == [i for i, pixel in enumerate(pixels) if pixel == k]
 
 
 @given(st.lists(st.tuples(st.integers(0, 22), st.integers(0, 18), st.booleans()), max_size=60))
