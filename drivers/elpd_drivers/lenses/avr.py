@@ -122,6 +122,11 @@ class AvrController:
         self._unconfirmed: tuple[int, bytes, int, int] | None = None  # sequence, frame, stops before it, tries
 
     @property
+    def trouble_bytes(self) -> bytes:
+        """A halt, and the driver off: with it the controller forgets its reference."""
+        return wire.HALT + self.last_resort
+
+    @property
     def capabilities(self) -> LensCapabilities:
         """True velocity, a halt within a step, a dead-man in the controller."""
         return LensCapabilities(

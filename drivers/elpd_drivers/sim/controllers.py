@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import grbl, tic, tmcl
+from elpd_drivers.lenses import avr, avr_wire, grbl, tic, tmcl
+from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
 from elpd_drivers.sim.boards.tic import BOARD as TIC
@@ -61,6 +62,15 @@ def _told_by_driver(wanted: Wanted) -> Table:
     }
 
 
+def _told_within(fastest_sps: float) -> Callable[[Wanted], Table]:
+    """Return such a table for a controller that makes so many steps a second at the most."""
+
+    def table(wanted: Wanted) -> Table:
+        return {**_told_by_driver(wanted), "max_speed_um_s": min(wanted.speed_um_s, fastest_sps * wanted.um_per_step)}
+
+    return table
+
+
 def _set_up(wanted: Wanted) -> Table:
     """Return the config of a board that keeps speed and acceleration in its own settings."""
     return {"speed_um_s": wanted.speed_um_s, "acceleration_um_s2": wanted.acceleration_um_s2}
@@ -71,6 +81,7 @@ CONTROLLERS: Mapping[str, Controller] = {
     "grbl": Controller(
         GRBL, grbl.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step, "trust_position": True}
     ),
+    "avr": Controller(AVR, avr.open_lens, _nothing, _told_within(avr_wire.FASTEST_SPS)),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
 }
 
