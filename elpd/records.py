@@ -281,7 +281,10 @@ class PhaseTime:
 
 @dataclass(frozen=True, slots=True)
 class FocusResult:
-    """The one terminal result of a focus request. Lengths in um on the motor's ruler, ``None`` where unknown."""
+    """The one terminal result of a focus request. Lengths in um on the motor's ruler, ``None`` where unknown.
+
+    ``warnings`` are sentences for the person, whatever the outcome: what was odd, and what to change.
+    """
 
     outcome: Outcome
     reason: str
@@ -296,6 +299,7 @@ class FocusResult:
     events: int
     lost: int
     details: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,11 @@ side the sweep came from, because backlash is invisible in read-back.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
-from elpd.focus import safety
+from elpd.focus import guards, safety
 from elpd.focus.approach import go_back, latency_us, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
@@ -37,6 +38,7 @@ from elpd.units import NS_PER_MS, HostNs, after_ms
 from elpd.vision.choose import propose_roi
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.reference import reference_from_frame
+from elpd.vision.resting import LISTEN_MS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,6 +112,7 @@ class FocusCycle:
         self._stop_latency_us: int | None = None
         self._estimate: FocusEstimate | None = None
         self._details: dict[str, Any] = {}
+        self._warnings: list[str] = []
         self.map: TemporalImage | None = None
         """The temporal map, once exposed, for whoever wants to store or show it."""
 
@@ -240,9 +243,23 @@ class FocusCycle:
         self._watch = watch
         self._stage.listener = watch.rest
         self._stage.wait_ms(BIAS_SETTLE_MS)
+        if watch.resting.restless:
+            self._stage.wait_ms(LISTEN_MS)
         self._stage.hear(safety.CAMERA_SILENCE_MS)
         watch.armed()
+        self._guard(watch)
         return watch
+
+    def _guard(self, watch: Watch) -> None:
+        """Say what the sensor at rest warns of, and sweep slowly enough for a lamp that flickers."""
+        resting = watch.resting
+        self._warnings += guards.of_rest(resting)
+        if resting.flicker is None:
+            return
+        speed_um_s = guards.speed_under(resting.flicker, resting.residue, self._settings)
+        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        watch.under_a_lamp(resting.flicker, speed_um_s)
+        self._warnings.append(guards.of_lamp(resting.flicker, speed_um_s))
 
     def _search(self, watch: Watch) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
@@ -391,6 +408,7 @@ class FocusCycle:
             events=0 if self._watch is None else self._watch.events_in_cycle,
             lost=self._stage.lost_events,
             details=self._details,
+            warnings=tuple(self._warnings),
         )
 
 
@@ -417,5 +435,6 @@ def result_fields(result: FocusResult) -> dict[str, Any]:
         "phases": [{"name": phase.name, "ms": phase.ms} for phase in result.phases],
         "events": result.events,
         "lost": result.lost,
+        "warnings": list(result.warnings),
         "details": result.details,
     }

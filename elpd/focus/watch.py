@@ -25,11 +25,13 @@ from elpd.vision.crossing import (
     Witness,
     frame_witness,
     fuse,
+    lamp_witness,
 )
 from elpd.vision.detector import Detector, RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.resting import Resting
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import FrameEnergy, PeakTrack
 
@@ -37,9 +39,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi
+    from elpd.vision.flicker import Flicker
     from elpd.vision.reference import Reference
 
-REST_WINDOW_US = 1000
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
 
@@ -126,8 +128,9 @@ class Watch:
         inside = np.zeros((geometry.height, geometry.width), np.bool_)
         inside[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width] = True
         self._inside = inside
-        self._resting = ElpWindows(reference.weights, inside, window_us=REST_WINDOW_US, rate_cap=True)
-        self._rest_sums = [0, 0, 0]  # elp, events, us
+        self.resting = Resting(roi, geometry)
+        """What the sensor says at rest."""
+        self._lamp: Flicker | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
@@ -153,27 +156,32 @@ class Watch:
 
     def rest(self, packet: CameraPacket) -> None:
         """Learn from a packet of a sensor that sees nothing move."""
-        for row in self._resting.feed(packet):
-            self._rest_sums[0] += int(row["elp"])
-            self._rest_sums[1] += int(row["n_on"] + row["n_off"])
-            self._rest_sums[2] += int(row["end_us"] - row["begin_us"])
-        self._decoder.feed(packet)
+        events = self._decoder.feed(packet)
+        self.resting.add(events.t, events.x, events.y, events.p, packet.complete_until_us)
 
     def armed(self) -> None:
-        """Close the lesson of the resting sensor."""
-        elp, events, us = self._rest_sums
-        if us > 0:
-            self._rest = RestingRate(elp / us, events / us)
+        """Close the lesson of the resting sensor: its rate is known, and hot pixels are not listened to any more."""
+        self._rest = self.resting.settle(self._reference.weights)
+        self._inside &= ~self.resting.hot
+
+    def under_a_lamp(self, lamp: Flicker, speed_um_s: float) -> None:
+        """Judge only whole periods of a lamp that flickers, of a sweep that is slow enough for them."""
+        self._lamp = lamp
+        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        shortest_us = 1e6 * TRAVEL_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um / speed_um_s
+        self._window_us = round(lamp.period_us * np.ceil(shortest_us / lamp.period_us))
 
     @property
     def resting_rate_hz(self) -> float:
-        """Events per second that the region sends at rest."""
+        """Events per second that the region sends at rest; a lamp's own do not count, because they are not noise."""
+        if self._lamp is not None:
+            return 0.0
         return 1e6 * self._rest.events_per_us
 
     @property
     def resting_events(self) -> int:
         """How many events the resting rate was learnt from."""
-        return self._rest_sums[1]
+        return self.resting.events
 
     def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
         """Begin a direction of travel: everything is judged afresh.
@@ -182,7 +190,7 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry)
+        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, whole_periods=self._lamp is not None)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
@@ -284,6 +292,8 @@ class Watch:
         if self.decided_us is None:
             return None
         memory = self._memory
+        if self._lamp is not None:
+            return self._estimate_under_a_lamp()
         ruler = self._ruler(self._begun_us, self.decided_us)
         deaf = memory.refractory()
         said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
@@ -297,7 +307,21 @@ class Watch:
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
             for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
         ]
-        found = fuse([*self._ask_frames(), *witnesses])
+        return self._on_the_ruler(fuse([*self._ask_frames(), *witnesses]))
+
+    def _estimate_under_a_lamp(self) -> FocusEstimate | None:
+        """Ask frames and the curve itself: turns of a pixel are the lamp's, and whole periods leave no dead zone."""
+        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
+        vertex = self._memory.track.vertex()
+        witnesses = [] if vertex is None else [lamp_witness(vertex, width_um, self._window_um)]
+        return self._on_the_ruler(fuse([*self._ask_frames(), *witnesses]))
+
+    @property
+    def _window_um(self) -> float:
+        return 1e-6 * self._window_us * self._settings.speed_um_s
+
+    def _on_the_ruler(self, found: FocusEstimate | None) -> FocusEstimate | None:
+        """Turn an estimate on the path of the sweep, which rises, into one on the motor's ruler."""
         if found is None:
             return None
         sign = self._sign

@@ -219,6 +219,15 @@ def frame_witness(vertex: Vertex, spacing: float) -> Witness:
     return Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * coarseness * vertex.width)))
 
 
+def lamp_witness(vertex: Vertex, width: float, spacing: float) -> Witness:
+    """Return what the curve of whole lamp periods says, one every *spacing* of travel.
+
+    Half a period is the lag of a mean over one; what dithering leaves of the sensor's hysteresis is not corrected.
+    """
+    systematic = SYSTEMATIC_VERTEX * width
+    return Witness("vertex", vertex.at, float(np.hypot(vertex.sigma, systematic)), 0.25 * spacing)
+
+
 def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     """Return the least-squares mean under the witnesses' joint covariance.
 

@@ -55,9 +55,22 @@ class EventMemory:
         Where to focus, and on what sensor.
     max_events:
         How many are kept.
+    hot:
+        (height, width) of the sensor: pixels not to listen to.
+    whole_periods:
+        Whether ``advance`` comes once in whole periods of a lamp that flickers: then what its events leave behind
+        counts as disorder, not how many they are.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS) -> None:
+    def __init__(
+        self,
+        roi: Roi,
+        geometry: Geometry,
+        max_events: int = MAX_EVENTS,
+        *,
+        hot: NDArray[np.bool_] | None = None,
+        whole_periods: bool = False,
+    ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
@@ -71,12 +84,16 @@ class EventMemory:
         self._max_events = max_events
         self.track = PeakTrack()
         self._forgotten = 0
+        self._hot = None if hot is None or not hot.any() else hot
+        self._disorder: list[float] | None = [] if whole_periods else None
         self.capped = 0
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
         inside = (x >= self._left) & (x < self._right) & (y >= self._top) & (y < self._bottom)
+        if self._hot is not None:
+            inside &= ~self._hot[y, x]
         t_us, on = t_us[inside], on[inside]
         x = (x[inside] - self._left).astype(np.uint16)
         y = (y[inside] - self._top).astype(np.uint16)
@@ -120,7 +137,11 @@ class EventMemory:
         until = int(np.searchsorted(self._t_us, until_us, side="left"))
         part = slice(self._taken, until)
         _, x, y, on = self._columns
+        before = None if self._disorder is None else self._energy.level.copy()
         self._energy.add(x[part], y[part], on[part])
+        if self._disorder is not None:
+            net = float(np.square(self._energy.level - before).sum(dtype=np.int64))
+            self._disorder.append(net + (self._disorder[-1] if self._disorder else 0.0))
         self._taken = until
         self.track.add(until_us, position, self._energy.measure())
 
@@ -139,7 +160,10 @@ class EventMemory:
         """Whether the image is sharper, at its peak, than as many events at random would have made it."""
         track = self.track
         height, width = self._shape
-        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
+        if self._disorder is None:
+            until = float(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
+        else:
+            until = self._disorder[track.peak]
         at_random = band_gain(BANDS_PX[0]) * until / (height * width)
         return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 
