@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 APPROACH_MARGIN_UM = 2.0
 """How much further than the backlash the final approach begins."""
 
+RETURN_SIGMAS = 6.0
+"""Under a lamp, how certainly the way back must have undone what the way out had done."""
+
 RETURN_SHARE = 0.5
 """The way back leads over the same ground as the way out, and beyond: half its events at the least."""
 
@@ -75,6 +78,15 @@ def verify(
     seen = watch.events_in_cycle - way.events_before
     seen -= round(resting_hz * (stage.now_ns() - way.begun_ns) / NS_PER_S)
     expected = watch.events_within(focus_um, stop_um) - round(resting_hz * way_back_um / settings.speed_um_s)
+    score = watch.return_score(focus_um)
+    if score is not None:  # under a lamp
+        if way_back_um > settings.depth_of_focus_um and score < RETURN_SIGMAS:
+            raise Ended(
+                Outcome.LENS_DID_NOT_MOVE,
+                f"the controller says that the lens went back {way_back_um:.0f} um, but the pixels do not show it "
+                f"({score:.1f} sigma, at least {RETURN_SIGMAS:.0f} are needed); check the coupling between motor and lens",
+            )
+        return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
         raise Ended(
             Outcome.LENS_DID_NOT_MOVE,

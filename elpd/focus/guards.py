@@ -45,7 +45,7 @@ def of_lamp(lamp: Flicker, speed_um_s: float) -> str:
     """Return what there is to tell of a lamp that flickers and was swept under."""
     return (
         f"the light flickers at {lamp.frequency_hz:.0f} Hz: the sweep was slowed down to {speed_um_s:.0f} um/s and judged "
-        "in whole periods, and the way back could not be checked by its events; use a lamp without flicker"
+        "in whole periods of it; a lamp without flicker lets it be faster"
     )
 
 

@@ -34,6 +34,7 @@ from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
 from elpd.vision.resting import Resting
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import FrameEnergy, PeakTrack
+from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -131,6 +132,7 @@ class Watch:
         self.resting = Resting(roi, geometry)
         """What the sensor says at rest."""
         self._lamp: Flicker | None = None
+        self._periods: WholePeriods | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
@@ -172,10 +174,13 @@ class Watch:
         self._window_us = round(lamp.period_us * np.ceil(shortest_us / lamp.period_us))
 
     @property
+    def lit(self) -> bool:
+        """Whether the sensor at rest has shown that the scene is in the light: a lamp flickers."""
+        return self._lamp is not None
+
+    @property
     def resting_rate_hz(self) -> float:
-        """Events per second that the region sends at rest; a lamp's own do not count, because they are not noise."""
-        if self._lamp is not None:
-            return 0.0
+        """Events per second that the region sends at rest."""
         return 1e6 * self._rest.events_per_us
 
     @property
@@ -190,7 +195,10 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, whole_periods=self._lamp is not None)
+        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot)
+        if self._lamp is not None:
+            self._periods = WholePeriods(self.resting.heard & ~self.resting.hot, at_us)
+            self._undone = np.zeros(self._inside.shape, np.int32)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
@@ -214,7 +222,7 @@ class Watch:
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
-            sample = self._located(row)
+            sample = self._net(self._located(row))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
@@ -241,6 +249,9 @@ class Watch:
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
+        if self._periods is not None:
+            self._periods.add(events.t, events.x, events.y, events.p)
+            return
         if self._passed:
             return  # a motor that brakes late goes far beyond what is of interest
         first = int(np.searchsorted(events.t, self._begun_us, side="left"))
@@ -251,7 +262,8 @@ class Watch:
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
             return
         self._ticked_um = self._here_um = end_um
-        self._memory.advance(sample.end_us, self._sign * end_um)
+        # Under a lamp a pixel has spoken at some time in the period: at its middle, in the mean.
+        self._memory.advance(sample.end_us, self._sign * (end_um if self._lamp is None else sample.position_um))
 
     @property
     def passed(self) -> bool:
@@ -293,7 +305,9 @@ class Watch:
             return None
         memory = self._memory
         if self._lamp is not None:
-            return self._estimate_under_a_lamp()
+            vertex, window_um = memory.track.vertex(), 1e-6 * self._window_us * self._settings.speed_um_s
+            seen = [] if vertex is None else [lamp_witness(vertex, self._width_um, window_um)]
+            return self._on_the_ruler(fuse([*self._ask_frames(), *seen]))
         ruler = self._ruler(self._begun_us, self.decided_us)
         deaf = memory.refractory()
         said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
@@ -302,23 +316,16 @@ class Watch:
         speed_um_us = 1e-6 * self._settings.speed_um_s
         unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
-        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+            for one in said.witnesses(unmeasured_lag_um, unexplained, self._width_um)
         ]
         return self._on_the_ruler(fuse([*self._ask_frames(), *witnesses]))
 
-    def _estimate_under_a_lamp(self) -> FocusEstimate | None:
-        """Ask frames and the curve itself: turns of a pixel are the lamp's, and whole periods leave no dead zone."""
-        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
-        vertex = self._memory.track.vertex()
-        witnesses = [] if vertex is None else [lamp_witness(vertex, width_um, self._window_um)]
-        return self._on_the_ruler(fuse([*self._ask_frames(), *witnesses]))
-
     @property
-    def _window_um(self) -> float:
-        return 1e-6 * self._window_us * self._settings.speed_um_s
+    def _width_um(self) -> float:
+        """The width that the curve of log S has in this optical system."""
+        return WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
 
     def _on_the_ruler(self, found: FocusEstimate | None) -> FocusEstimate | None:
         """Turn an estimate on the path of the sweep, which rises, into one on the motor's ruler."""
@@ -347,10 +354,46 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
+        if self._periods is not None:
+            self.keep(packet)
         for row in self._windows.feed(packet):
-            self.events_in_cycle += int(row["n_on"] + row["n_off"])
+            sample = self._net(self._located(row))
+            self.events_in_cycle += sample.n_on + sample.n_off
+
+    def return_score(self, focus_um: float) -> float | None:
+        """Return by how many standard deviations the way back undid what the way out from focus had done to the pixels.
+
+        Only under a lamp, where events cannot simply be counted; else ``None``.
+        """
+        if self._periods is None:
+            return None
+        out = self._memory.change_beyond(self._sign * focus_um).astype(np.float64)
+        product = out * self._memory.cut(self._undone)
+        return float(-product.sum() / max(np.sqrt(np.square(product).sum()), 1.0))
 
     # --- pieces ---
+
+    def _net(self, sample: ElpSample) -> ElpSample:
+        """Under a lamp, keep of a window only what whole periods leave; remember that for the estimate."""
+        if self._periods is None:
+            return sample
+        net = self._periods.close(sample.begin_us, sample.end_us)
+        if not self._passed:
+            if sample.begin_us >= self._begun_us:  # else only part of a period was heard
+                self._memory.add(*net)
+        else:
+            np.add.at(self._undone, (net.y, net.x), 2 * net.on.astype(np.int32) - 1)
+        inside = self._inside[net.y, net.x]
+        weight = np.where(inside, self._reference.weights[net.y, net.x], 0).astype(np.int64)
+        sign = 2 * net.on.astype(np.int64) - 1
+        n_on = int(net.on[inside].sum())
+        return replace(
+            sample,
+            elp=-int(sign @ weight),
+            energy=int(weight @ weight),
+            n_on=n_on,
+            n_off=int(inside.sum()) - n_on,
+        )
 
     def _located(self, row: Any) -> ElpSample:
         begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))

@@ -42,6 +42,9 @@ SYSTEMATIC_VERTEX = 0.08
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
+SYSTEMATIC_UNDER_A_LAMP = 0.09
+"""The same for the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
+
 VERTEX_IN_MOTION = 0.12
 """What scene motion adds to the vertex' error, where it strays all pairs."""
 
@@ -56,6 +59,9 @@ UNMEASURED_LAG_US = 1_500.0
 
 COARSE_FRAMES = 0.25
 """Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
+
+PERIOD_ERROR = 0.15
+"""How far from the middle of a lamp's period its net events may lie in the mean, in periods."""
 
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
@@ -220,12 +226,12 @@ def frame_witness(vertex: Vertex, spacing: float) -> Witness:
 
 
 def lamp_witness(vertex: Vertex, width: float, spacing: float) -> Witness:
-    """Return what the curve of whole lamp periods says, one every *spacing* of travel.
+    """Return what the curve of whole lamp periods says, one point every *spacing*, dated to the periods' middle.
 
-    Half a period is the lag of a mean over one; what dithering leaves of the sensor's hysteresis is not corrected.
+    A lamp that is seen at all dithers the comparators: there is no dead zone to correct for.
     """
-    systematic = SYSTEMATIC_VERTEX * width
-    return Witness("vertex", vertex.at, float(np.hypot(vertex.sigma, systematic)), 0.25 * spacing)
+    sigma = float(np.hypot(vertex.sigma, SYSTEMATIC_UNDER_A_LAMP * width))
+    return Witness("vertex", vertex.at, sigma, PERIOD_ERROR * spacing)
 
 
 def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:

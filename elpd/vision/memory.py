@@ -15,7 +15,7 @@ import numpy as np
 
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
-from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.integral import BANDS_PX, add_events, band_gain
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
@@ -57,19 +57,10 @@ class EventMemory:
         How many are kept.
     hot:
         (height, width) of the sensor: pixels not to listen to.
-    whole_periods:
-        Whether ``advance`` comes once in whole periods of a lamp that flickers: then what its events leave behind
-        counts as disorder, not how many they are.
     """
 
     def __init__(
-        self,
-        roi: Roi,
-        geometry: Geometry,
-        max_events: int = MAX_EVENTS,
-        *,
-        hot: NDArray[np.bool_] | None = None,
-        whole_periods: bool = False,
+        self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS, hot: NDArray[np.bool_] | None = None
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
@@ -85,7 +76,6 @@ class EventMemory:
         self.track = PeakTrack()
         self._forgotten = 0
         self._hot = None if hot is None or not hot.any() else hot
-        self._disorder: list[float] | None = [] if whole_periods else None
         self.capped = 0
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
@@ -122,6 +112,20 @@ class EventMemory:
         self._taken -= drop
         self._forgotten += drop
 
+    def cut(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of an image of the whole sensor that is remembered here."""
+        return image[self._top : self._bottom, self._left : self._right]
+
+    def change_beyond(self, position: float) -> NDArray[np.int32]:
+        """Return by how many events each pixel's level changed since the curve passed *position*, (height, width)."""
+        beyond = np.flatnonzero(np.array(self.track.positions) >= position)
+        since_us = self.track.times_us[int(beyond[0])] if beyond.size else self.track.times_us[-1]
+        part = slice(int(np.searchsorted(self._t_us, since_us, side="left")), self._count)
+        _, x, y, on = self._columns
+        change = np.zeros(self._shape, np.int32)
+        add_events(x[part], y[part], on[part], change)
+        return change
+
     @property
     def _t_us(self) -> NDArray[np.int64]:
         times: NDArray[np.int64] = self._columns[0][: self._count]
@@ -137,11 +141,7 @@ class EventMemory:
         until = int(np.searchsorted(self._t_us, until_us, side="left"))
         part = slice(self._taken, until)
         _, x, y, on = self._columns
-        before = None if self._disorder is None else self._energy.level.copy()
         self._energy.add(x[part], y[part], on[part])
-        if self._disorder is not None:
-            net = float(np.square(self._energy.level - before).sum(dtype=np.int64))
-            self._disorder.append(net + (self._disorder[-1] if self._disorder else 0.0))
         self._taken = until
         self.track.add(until_us, position, self._energy.measure())
 
@@ -160,10 +160,7 @@ class EventMemory:
         """Whether the image is sharper, at its peak, than as many events at random would have made it."""
         track = self.track
         height, width = self._shape
-        if self._disorder is None:
-            until = float(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
-        else:
-            until = self._disorder[track.peak]
+        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
         at_random = band_gain(BANDS_PX[0]) * until / (height * width)
         return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 

@@ -14,6 +14,7 @@ import numpy as np
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
 from elpd.vision.flicker import find_flicker, residue
+from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,7 @@ RESTLESS_SIGMAS = 5.0
 HOT_SIGMAS = 5.0
 HOT_EVENTS = 3.0
 """A pixel is hot where it fires this many standard deviations and events more often than its second busiest neighbour:
-an edge that trembles, or a lamp, makes neighbours fire alike."""
+an edge that trembles makes neighbours fire alike. By chance one in 10⁸ pixels does."""
 
 
 class Resting:
@@ -49,7 +50,8 @@ class Resting:
     def __init__(self, roi: Roi, geometry: Geometry) -> None:
         self._geometry = geometry
         self._inside = _box(roi, geometry, 0)
-        self._heard = _box(roi, geometry, ROI_MARGIN_PX)
+        self.heard = _box(roi, geometry, ROI_MARGIN_PX)
+        """The region and its margin, as pixels of the sensor."""
         self._pieces: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]] = []
         self._count = 0
         self._begin_us: int | None = None
@@ -74,7 +76,7 @@ class Resting:
         until_us: int | None,
     ) -> None:
         """Take events in time order, none before what was taken; *until_us* promises that no earlier will follow."""
-        inside = self._heard[y, x]
+        inside = self.heard[y, x]
         if self._begin_us is None:
             if until_us is None and t_us.size == 0:
                 return
@@ -108,13 +110,13 @@ class Resting:
     def settle(self, weights: NDArray[np.int16]) -> RestingRate:
         """Draw the conclusions; return what the region says at rest under *weights*, hot pixels left out."""
         t_us, pixel, on = self._events()
-        self.hot = self._hot(pixel)
+        begin_us = self._begin_us or 0
+        self.flicker = find_flicker(t_us, on, begin_us, self._end_us)
+        self.hot = self._hot(pixel, on)
         kept = ~self.hot.ravel()[pixel]
         t_us, pixel, on = t_us[kept], pixel[kept], on[kept]
         counted = int(self._inside.ravel()[pixel].sum())
         self.events = counted
-        begin_us = self._begin_us or 0
-        self.flicker = find_flicker(t_us, on, begin_us, self._end_us)
         duration_us = self.duration_us
         self._pieces = []
         if duration_us == 0:
@@ -122,7 +124,8 @@ class Resting:
         self.noise_hz = 1e6 * counted / duration_us / max(1, int((self._inside & ~self.hot).sum()))
         if self.flicker is not None:
             self.residue = residue(t_us, pixel, on, self.flicker, self._end_us)
-            return RestingRate(0.0, counted / duration_us)
+            self.events, listened_us = self._net_of_periods(t_us, pixel, on, self.flicker.period_us)
+            return RestingRate(0.0, self.events / listened_us)
         elp = -float((2.0 * on - 1.0) @ weights.ravel()[pixel])
         return RestingRate(elp / duration_us, counted / duration_us)
 
@@ -133,10 +136,26 @@ class Resting:
         self._pieces = [(t_us, pixel, on)]
         return t_us, pixel, on
 
-    def _hot(self, pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _net_of_periods(
+        self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], period_us: float
+    ) -> tuple[int, float]:
+        """Return how many net events whole periods leave in the region, and how long those lasted."""
+        width = self._geometry.width
+        periods = WholePeriods(self._inside, self._begin_us or 0)
+        periods.add(t_us, (pixel % width).astype(np.uint16), (pixel // width).astype(np.uint16), on)
+        whole = max(1, int(self.duration_us / period_us))
+        edges = (self._begin_us or 0) + np.rint(period_us * np.arange(whole + 1)).astype(np.int64)
+        net = sum(periods.close(int(edges[k]), int(edges[k + 1])).t_us.size for k in range(whole))
+        return net, whole * period_us
+
+    def _hot(self, pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Judge by counts; under a lamp, to which pixels answer as differently as their thresholds are, by the net."""
         height, width = self._geometry.height, self._geometry.width
-        count = np.bincount(pixel, minlength=height * width).reshape(height, width)
-        return hot_pixels(count)
+        if self.flicker is None:
+            count = np.bincount(pixel, minlength=height * width)
+        else:
+            count = np.abs(np.rint(np.bincount(pixel, weights=2.0 * on - 1.0, minlength=height * width)))
+        return hot_pixels(count.reshape(height, width).astype(np.int64))
 
 
 def _box(roi: Roi, geometry: Geometry, margin: int) -> NDArray[np.bool_]:
@@ -159,5 +178,5 @@ def hot_pixels(count: NDArray[np.int64]) -> NDArray[np.bool_]:
             one = wide[row : row + height, column : column + width]
             second = np.maximum(second, np.minimum(highest, one))
             highest = np.maximum(highest, one)
-    excess = count - second
-    return np.asarray(excess > HOT_EVENTS + HOT_SIGMAS * np.sqrt(second + 1.0), np.bool_) & (count > 0)
+    expected = second + float(count.mean())
+    return np.asarray(count - second > HOT_EVENTS + HOT_SIGMAS * np.sqrt(expected), np.bool_)
