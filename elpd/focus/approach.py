@@ -84,7 +84,7 @@ def verify(
             raise Ended(
                 Outcome.LENS_DID_NOT_MOVE,
                 f"the controller says that the lens went back {way_back_um:.0f} um, but the pixels do not show it "
-                f"({score:.1f} sigma, at least {RETURN_SIGMAS:.0f} are needed); check the coupling between motor and lens",
+                f"({score:.1f} sigma, at least {RETURN_SIGMAS:.0f} are needed); check the coupling of motor and lens",
             )
         return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:

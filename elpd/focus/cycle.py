@@ -291,6 +291,7 @@ class FocusCycle:
                 "the sign changed, but no estimator agrees on where; try again with a larger ROI or more light",
             )
         self._estimate = estimate
+        self._warnings += guards.of_depths(watch.depths_um) + guards.of_late_lamp(watch.flicker)
         self._details["method"] = estimate.method
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
@@ -388,6 +389,17 @@ class FocusCycle:
         if self._observer is not None:
             self._observer.sample(sample, score)
 
+    def _told(self) -> tuple[str, ...]:
+        """Return every warning, those about what was lost or clipped last."""
+        told = [*self._warnings, *guards.of_loss(self._stage.lost_events)]
+        if self._watch is not None:
+            roi, frame = self._watch.roi, self._stage.frame
+            told += guards.of_rate(self._watch.rate.plateau_mev_s())
+            told += guards.of_frame(
+                None if frame is None else frame.pixels[roi.y :, roi.x :][: roi.height, : roi.width]
+            )
+        return tuple(told)
+
     def _result(self, outcome: Outcome, reason: str, final_um: float) -> FocusResult:
         estimate = self._estimate
         ends = [at for _, at in self._phases[1:]]
@@ -408,7 +420,8 @@ class FocusCycle:
             events=0 if self._watch is None else self._watch.events_in_cycle,
             lost=self._stage.lost_events,
             details=self._details,
-            warnings=tuple(self._warnings),
+            warnings=self._told(),
+            depths_um=() if self._watch is None else self._watch.depths_um,
         )
 
 
@@ -436,5 +449,6 @@ def result_fields(result: FocusResult) -> dict[str, Any]:
         "events": result.events,
         "lost": result.lost,
         "warnings": list(result.warnings),
+        "depths_um": list(result.depths_um),
         "details": result.details,
     }

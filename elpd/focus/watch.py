@@ -33,6 +33,7 @@ from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
 from elpd.vision.resting import Resting
 from elpd.vision.ruler import Ruler
+from elpd.vision.saturation import RateWatch
 from elpd.vision.track import FrameEnergy, PeakTrack
 from elpd.vision.whole_periods import WholePeriods
 
@@ -131,6 +132,8 @@ class Watch:
         self._inside = inside
         self.resting = Resting(roi, geometry)
         """What the sensor says at rest."""
+        self.rate = RateWatch()
+        """Whether the read-out is full."""
         self._lamp: Flicker | None = None
         self._periods: WholePeriods | None = None
         self._windows: ElpWindows | None = None
@@ -151,6 +154,10 @@ class Watch:
         """When the window that decided was complete, on the sensor's clock."""
         self.events = 0
         """Events in the region since this direction of travel began."""
+        self.flicker: Flicker | None = None
+        """A lamp's flicker that only the sweep has shown."""
+        self.depths_um: tuple[float, ...] = ()
+        """Where planes of the region are in focus, if the estimate has found several, the first met first."""
         self.events_in_cycle = 0
         """Events in the region since the watch was armed."""
 
@@ -249,6 +256,7 @@ class Watch:
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
+        self.rate.add(events.t)
         if self._periods is not None:
             self._periods.add(events.t, events.x, events.y, events.p)
             return
@@ -320,7 +328,10 @@ class Watch:
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
             for one in said.witnesses(unmeasured_lag_um, unexplained, self._width_um)
         ]
-        return self._on_the_ruler(fuse([*self._ask_frames(), *witnesses]))
+        self.flicker = memory.flicker()
+        self.depths_um = tuple(self._sign * at for at in said.depths)
+        frames = [] if said.depths else self._ask_frames()  # of several planes frames show a mixture
+        return self._on_the_ruler(fuse([*frames, *witnesses]))
 
     @property
     def _width_um(self) -> float:

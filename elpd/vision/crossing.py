@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
+from elpd.vision.depths import find_depths
 from elpd.vision.integral import (
     BANDS_PX,
     MISMATCH,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    from elpd.vision.pairs import Pairs
 
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
@@ -73,6 +76,9 @@ LEVELS_AT_ONCE = 1 << 24
 
 FLANK = 0.6
 ROI_MARGIN_PX = 14
+
+PLANE_KERNEL = 0.1
+"""Standard deviation, in widths, of the kernel that finds the mode of one plane's pairs among several planes."""
 
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
@@ -137,6 +143,11 @@ class EventWitnesses:
     vertex: Vertex | None
     pairs: Mode | None
     lag: Lag
+    depths: tuple[float, ...] = ()
+    """Where planes of the region are in focus, nearest first along the sweep, if there are several. Then ``pairs`` are
+    those of the first, and there is no vertex: sharpness shows none of them."""
+    plane_width: float = 0.0
+    """Width of one plane's curve, as far as its rising flank tells, where there are several."""
 
     def witnesses(
         self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
@@ -180,11 +191,15 @@ def ask_events(
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     weight, slowness = _by_brightness(brightness, events)
     vertex, level_at_peak = _vertex(events, ticks, peak, weight)
-    pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness)
+    found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
+    pairs, lag = _pair_mode(found, level_at_peak, peak, end, slowness)
     if lag.at > 0.0 and vertex is not None:
         quick = replace(events, position=events.position - lag.at * slowness[events.y, events.x])
         corrected, _ = _vertex(quick, ticks, peak, weight)
         vertex = corrected or vertex
+    planes = _planes(found, level_at_peak, begin, peak, lag.at * slowness)
+    if planes:
+        return EventWitnesses(None, planes[0], lag, tuple(plane.at for plane in planes), _flank_width(begin, peak))
     return EventWitnesses(vertex, pairs, lag)
 
 
@@ -278,10 +293,8 @@ def _rebuilt_curve(
 
 
 def _pair_mode(
-    events: EventStretch, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
+    pairs: Pairs, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
 ) -> tuple[Mode | None, Lag]:
-    shape = (events.height, events.width)
-    pairs = find_pairs(events.t_us, events.x, events.y, events.on, events.position, shape)
     if pairs.on.size == 0:
         return None, Lag()
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
@@ -295,6 +308,27 @@ def _pair_mode(
     if mode is None or not slowness.any():
         return mode, Lag()
     return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past)
+
+
+def _flank_width(begin: float, peak: float) -> float:
+    """Return the width of a curve that rose by ``FLANK`` from *begin* to *peak*."""
+    return (peak - begin) / float(np.sqrt(2.0 * FLANK))
+
+
+def _planes(
+    pairs: Pairs, level: NDArray[np.float32], begin: float, peak: float, late: NDArray[np.float64]
+) -> list[Mode]:
+    """Return where planes of the region are in focus, if there are several; *late* is each pixel's lag."""
+    width = _flank_width(begin, peak)
+    curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
+    middle = pairs.middle - late[pairs.y, pairs.x]
+    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (middle >= begin - width)
+    weights = (np.abs(curvature) / np.maximum(pairs.after - pairs.before, 1e-3 * width))[believed]
+    middle = middle[believed]
+    clusters = find_depths(middle, weights, pairs.x[believed], pairs.y[believed], width)
+    held = sum(float(weights[one].sum()) for one in clusters) / max(float(weights.sum()), 1e-300)
+    modes = [weighted_mode(middle[one], weights[one], PLANE_KERNEL * width) for one in clusters]
+    return [replace(mode, share=held) for mode in modes if mode is not None]
 
 
 def without_lag(

@@ -1,4 +1,4 @@
-"""Does the light flicker, at what frequency, and does it leave anything behind?
+"""Whether the light flickers, at what frequency, and whether it leaves anything behind.
 
 A lamp that flickers makes all lit pixels fire ON together and OFF together, so the difference of ON and OFF events
 swings with the lamp, while a lens or an edge that moves makes about as many of one kind as of the other. The test is a

@@ -15,6 +15,7 @@ import numpy as np
 
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
+from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, add_events, band_gain
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from elpd.records import Geometry, Roi
     from elpd.vision.crossing import EventWitnesses, Witness
+    from elpd.vision.flicker import Flicker
     from elpd.vision.ruler import Ruler
 
 MIN_EVENTS = 1_000
@@ -77,6 +79,8 @@ class EventMemory:
         self._forgotten = 0
         self._hot = None if hot is None or not hot.any() else hot
         self.capped = 0
+        self.depths: tuple[float, ...] = ()
+        """Where planes of the region are in focus, nearest first along the sweep, if ``witnesses`` found several."""
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
@@ -135,6 +139,13 @@ class EventMemory:
         """Return how long a pixel is deaf after an event, as far as the events tell."""
         t_us, x, y, _ = (column[: self._count] for column in self._columns)
         return refractory_period(t_us, x, y, self._shape)
+
+    def flicker(self) -> Flicker | None:
+        """Return a lamp's flicker, if the events show one."""
+        if self._count == 0:
+            return None
+        t_us, on = self._t_us, self._columns[3][: self._count]
+        return find_flicker(t_us, on, int(t_us[0]), int(t_us[-1]) + 1)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
@@ -197,11 +208,14 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
         said = self.ask(now_us, ruler, brightness)
-        if said is None or said.vertex is None:
+        self.depths = ()
+        if said is None or (said.vertex is None and not said.depths):
             return [], None
         _, _, sign = ruler.stretch(now_us)
         lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
-        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)], said.vertex.width
+        self.depths = tuple(sign * at for at in said.depths)
+        width = said.plane_width if said.vertex is None else said.vertex.width
+        return [replace(one, at=sign * one.at) for one in said.witnesses(lag, width=width)], width
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:

@@ -1,8 +1,8 @@
 """What a sensor says while lens and scene rest: its noise, its hot pixels, and whether the light flickers.
 
-A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more than
-independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be told
-from a hand that shakes.
+A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
+than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
+told from a hand that shakes.
 """
 
 from __future__ import annotations

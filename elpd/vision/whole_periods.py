@@ -1,9 +1,9 @@
 """What is left of events after whole periods of a lamp that flickers.
 
-A lamp takes every pixel up and down again, and after a period the pixel's level is where the scene has it. So the events
-of a period are replaced by their *net*: so many of one polarity as the level has changed. The net events are what a
-sensor under steady light would have sent, dated to the middle of the period, and everything that reads events can read
-them. The lamp even does a service: it dithers the comparators, whose dead zone shrinks with its depth.
+A lamp takes every pixel up and down again, and after a period the pixel's level is where the scene has it. So the
+events of a period are replaced by their *net*: so many of one polarity as the level has changed. The net events are
+what a sensor under steady light would have sent, dated to the middle of the period, and everything that reads events
+can read them. The lamp even does a service: it dithers the comparators, whose dead zone shrinks with its depth.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def test_a_pan_adds_to_any_motion_and_stays_within_reach() -> None:
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_a_rate_limit_thins_evenly_and_counts_or_not(told: bool) -> None:
+def test_a_rate_limit_thins_evenly_and_counts_or_not(*, told: bool) -> None:
     count = 10_000
     events = Events(np.arange(count), np.zeros(count, np.uint16), np.zeros(count, np.uint16), np.ones(count, np.uint8))
     left = RateLimit(2.0, told=told).thinned(events)

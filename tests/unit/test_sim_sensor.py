@@ -5,8 +5,8 @@ from __future__ import annotations
 import naive_sim
 import numpy as np
 import pytest
-from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
 from elpd_drivers.sim.optics import Lamp
+from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
 from elpd_drivers.sim.sensor import MISMATCH_STEP, EventSensor
 from elpd_drivers.sim.world import random_stream
 from hypothesis import given, settings
