@@ -82,6 +82,8 @@ GUARDS = {
     "planes 15 um apart": _planes(15.0),
     "planes 60 um apart, shaken": _planes(60.0, "sim.motion=moderate"),
     "planes 15 um apart, shaken": _planes(15.0, "sim.motion=moderate"),
+    "shaken": Guard(("sim.motion=violent",)),
+    "shaken by hand": Guard(("sim.motion=shake",)),
     "overexposed": Guard(("sim.overexposed=0.4",)),
     "rate limit, told": Guard(("sim.rate_limit_mev_s=0.3",)),
     "rate limit, silent": Guard(("sim.rate_limit_mev_s=0.3", "sim.rate_limit_told=false")),

@@ -36,6 +36,9 @@ LEAST_SHARE = 0.3
 """Amplitude of the swing over the rate of events: one where all events are the lamp's, a few hundredths in scenes that
 move."""
 
+NEARLY = 0.5
+"""Power of a line over that of the highest from which on the lower frequency is believed."""
+
 STEPS_PER_RESOLUTION = 8
 
 
@@ -84,12 +87,23 @@ def find_flicker(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, 
     variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
     power = amplitude**2 / max(variance, 1e-12)
     power /= max(1.0, float(np.median(power)) / np.log(2.0))
-    top = int(np.argmax(power))
+    top = _lowest_line(power)
     false_alarm = float(min(1.0, independent * np.exp(-power[top])))
     share = float(2.0 * amplitude[top] / max(float(taper @ count), 1e-12))
     if false_alarm > FALSE_ALARM or share < LEAST_SHARE:
         return None
     return Flicker(_refined(frequencies, power, top), min(share, 1.0), false_alarm)
+
+
+def _lowest_line(power: NDArray[np.float64]) -> int:
+    """Return the top of the lowest line nearly as high as the highest.
+
+    A lamp has harmonics, and where events are stamped by a coarse clock, mirror images of its line.
+    """
+    first = int(np.flatnonzero(power >= NEARLY * power.max())[0])
+    while first + 1 < power.size and power[first + 1] > power[first]:
+        first += 1
+    return first
 
 
 def _refined(frequencies: NDArray[np.float64], power: NDArray[np.float64], top: int) -> float:

@@ -66,8 +66,8 @@ class SimSettings:
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
     half of the picture is in focus so much further along the travel. With ``object_px_s`` a textured square, in the
     scene's plane, goes across it. ``overexposed`` is the share of a frame's pixels that clip. Events beyond
-    ``rate_limit_mev_s`` do not leave the sensor, which says so (``rate_limit_told``) or not. The ``camera_*``, ``drop_*`` and ``aperture_stuck`` or
-    ``_slow`` keys inject faults, in seconds after the camera's start.
+    ``rate_limit_mev_s`` do not leave the sensor, which says so (``rate_limit_told``) or not. The ``camera_*``,
+    ``drop_*`` and ``aperture_stuck`` or ``_slow`` keys inject faults, in seconds after the camera's start.
     """
 
     seed: int = 0
