@@ -281,7 +281,12 @@ class PhaseTime:
 
 @dataclass(frozen=True, slots=True)
 class FocusResult:
-    """The one terminal result of a focus request. Lengths in um on the motor's ruler, ``None`` where unknown."""
+    """The one terminal result of a focus request. Lengths in um on the motor's ruler, ``None`` where unknown.
+
+    ``warnings`` are sentences for the person, whatever the outcome: what was odd, and what to change.
+    ``depths_um`` are the positions where planes of the region are in focus, if several were seen, the one that the
+    sweep met first (where the lens is) first.
+    """
 
     outcome: Outcome
     reason: str
@@ -296,6 +301,8 @@ class FocusResult:
     events: int
     lost: int
     details: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    depths_um: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

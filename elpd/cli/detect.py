@@ -192,6 +192,8 @@ def _answer(found: Detection) -> dict[str, Any]:
         "events": found.events,
         "windows": found.windows,
         "reason": found.reason,
+        "warnings": list(found.warnings),
+        "depths_us": list(found.depths_us),
         "contributions": [
             {"name": name, "at": at, "sigma": sigma, "weight": weight}
             for name, at, sigma, weight in (found.focus.contributions if found.focus else ())
@@ -201,6 +203,8 @@ def _answer(found: Detection) -> dict[str, Any]:
 
 def _tell(found: Detection) -> None:
     print(f"{found.outcome.value}: {found.reason}")
+    for warning in found.warnings:
+        print(f"  warning: {warning}")
     print(f"direction {found.direction.value}, {found.events} events in {found.windows} windows")
     if found.focus_us is not None:
         print(f"focus at {found.focus_us} us ± {found.sigma_us} us, decided at {found.decided_us} us ({found.method})")

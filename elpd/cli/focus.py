@@ -74,6 +74,8 @@ def _reference_path(reference: str | None, config: Config) -> Path | None:
 
 def _tell(fields: dict[str, Any]) -> None:
     print(f"{fields['outcome']}: {fields['reason']}")
+    for warning in fields["warnings"]:
+        print(f"  warning: {warning}")
     for name, unit in (("focus_um", "um"), ("sigma_um", "um"), ("stop_um", "um"), ("final_um", "um")):
         if fields[name] is not None:
             print(f"  {name.removesuffix('_um'):10s} {fields[name]:10.2f} {unit}")

@@ -25,6 +25,9 @@ BRAKING_SHARE = 0.25
 TURN_MS = 5.0
 """A turn is over within this time of the command that makes it."""
 
+RETURN_SIGMAS = 6.0
+"""Under a lamp, how certainly the way back must have undone what the way out had done."""
+
 RETURN_SHARE = 0.5
 """The way back leads over the same ground as the way out, and beyond: half its events at the least."""
 
@@ -149,6 +152,9 @@ def verify(
     seen = watch.events_in_cycle - way.events_before
     seen -= round(resting_hz * (stage.now_ns() - way.begun_ns) / NS_PER_S)
     expected = watch.events_within(focus_um, stop_um) - round(resting_hz * way_back_um / settings.speed_um_s)
+    score = watch.return_score(focus_um)
+    if score is not None and score >= RETURN_SIGMAS:
+        return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
         raise Ended(
             Outcome.LENS_DID_NOT_MOVE,

@@ -11,10 +11,11 @@ side the sweep came from, because backlash is invisible in read-back.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
-from elpd.focus import safety
+from elpd.focus import guards, safety
 from elpd.focus.approach import WayBack, standstill, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
@@ -37,6 +38,7 @@ from elpd.units import NS_PER_MS, HostNs, after_ms
 from elpd.vision.choose import propose_roi
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.reference import reference_from_frame
+from elpd.vision.resting import LISTEN_MS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -110,6 +112,7 @@ class FocusCycle:
         self._stop_latency_us: int | None = None
         self._estimate: FocusEstimate | None = None
         self._details: dict[str, Any] = {}
+        self._warnings: list[str] = []
         self.map: TemporalImage | None = None
         """The temporal map, once exposed, for whoever wants to store or show it."""
 
@@ -239,9 +242,23 @@ class FocusCycle:
         self._watch = watch
         self._stage.listener = watch.rest
         self._stage.wait_ms(BIAS_SETTLE_MS)
+        if watch.resting.restless:
+            self._stage.wait_ms(LISTEN_MS)
         self._stage.hear(safety.CAMERA_SILENCE_MS)
         watch.armed()
+        self._guard(watch)
         return watch
+
+    def _guard(self, watch: Watch) -> None:
+        """Say what the sensor at rest warns of, and sweep slowly enough for a lamp that flickers."""
+        resting = watch.resting
+        self._warnings += guards.of_rest(resting)
+        if resting.flicker is None:
+            return
+        speed_um_s = guards.speed_under(resting.flicker, resting.residue, self._settings)
+        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        watch.under_a_lamp(resting.flicker, speed_um_s)
+        self._warnings.append(guards.of_lamp(resting.flicker, speed_um_s))
 
     def _search(self, watch: Watch) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
@@ -292,6 +309,7 @@ class FocusCycle:
                 "the sign changed, but no estimator agrees on where; try again with a larger ROI or more light",
             )
         self._estimate = estimate
+        self._warnings += guards.of_depths(watch.depths_um) + guards.of_late_lamp(watch.flicker)
         self._details["method"] = estimate.method
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
@@ -389,6 +407,17 @@ class FocusCycle:
         if self._observer is not None:
             self._observer.sample(sample, score)
 
+    def _told(self) -> tuple[str, ...]:
+        """Return every warning, those about what was lost or clipped last."""
+        told = [*self._warnings, *guards.of_loss(self._stage.lost_events)]
+        if self._watch is not None:
+            roi, frame = self._watch.roi, self._stage.frame
+            told += guards.of_rate(self._watch.rate.plateau_mev_s())
+            told += guards.of_frame(
+                None if frame is None else frame.pixels[roi.y :, roi.x :][: roi.height, : roi.width]
+            )
+        return tuple(told)
+
     def _result(self, outcome: Outcome, reason: str, final_um: float) -> FocusResult:
         estimate = self._estimate
         ends = [at for _, at in self._phases[1:]]
@@ -409,6 +438,8 @@ class FocusCycle:
             events=0 if self._watch is None else self._watch.events_in_cycle,
             lost=self._stage.lost_events,
             details=self._details,
+            warnings=self._told(),
+            depths_um=() if self._watch is None else self._watch.depths_um,
         )
 
 
@@ -435,5 +466,7 @@ def result_fields(result: FocusResult) -> dict[str, Any]:
         "phases": [{"name": phase.name, "ms": phase.ms} for phase in result.phases],
         "events": result.events,
         "lost": result.lost,
+        "warnings": list(result.warnings),
+        "depths_um": list(result.depths_um),
         "details": result.details,
     }

@@ -105,7 +105,7 @@ class Search:
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
         turned_at_um: float | None = None
-        lit, dark = False, True
+        lit, dark = watch.lit, True
         while True:
             self._stage.listener = self._stage.interrupt = None  # a sweep asks for itself, and stops the lens first
             self.sign = sign
@@ -145,8 +145,8 @@ class Search:
                 if lit and dark:
                     raise Ended(
                         Outcome.LENS_DID_NOT_MOVE,
-                        "nothing changed while the lens should have moved, and yet the scene is in the light: the "
-                        "aperture shows it; check the coupling, and that the motor turns",
+                        "nothing changed while the lens should have moved, and yet the scene is in the light "
+                        "(the aperture shows it, or its lamp); check the coupling, and that the motor turns",
                     )
                 if report.end is SweepEnd.RULE:
                     raise ended_by(report.verdict)

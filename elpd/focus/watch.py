@@ -25,21 +25,25 @@ from elpd.vision.crossing import (
     Witness,
     frame_witness,
     fuse,
+    lamp_witness,
 )
 from elpd.vision.detector import Detector, RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.resting import Resting
 from elpd.vision.ruler import Ruler
+from elpd.vision.saturation import RateWatch
 from elpd.vision.track import FrameEnergy, PeakTrack
+from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi
+    from elpd.vision.flicker import Flicker
     from elpd.vision.reference import Reference
 
-REST_WINDOW_US = 1000
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
 
@@ -127,8 +131,12 @@ class Watch:
         inside = np.zeros((geometry.height, geometry.width), np.bool_)
         inside[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width] = True
         self._inside = inside
-        self._resting = ElpWindows(reference.weights, inside, window_us=REST_WINDOW_US, rate_cap=True)
-        self._rest_sums = [0, 0, 0]  # elp, events, us
+        self.resting = Resting(roi, geometry)
+        """What the sensor says at rest."""
+        self.rate = RateWatch()
+        """Whether the read-out is full."""
+        self._lamp: Flicker | None = None
+        self._periods: WholePeriods | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
@@ -148,6 +156,10 @@ class Watch:
         """When the window that decided was complete, on the sensor's clock."""
         self.events = 0
         """Events in the region since this direction of travel began."""
+        self.flicker: Flicker | None = None
+        """A lamp's flicker that only the sweep has shown."""
+        self.depths_um: tuple[float, ...] = ()
+        """Where planes of the region are in focus, if the estimate has found several, the first met first."""
         self.events_in_cycle = 0
         """Events in the region since the watch was armed."""
 
@@ -155,17 +167,25 @@ class Watch:
 
     def rest(self, packet: CameraPacket) -> None:
         """Learn from a packet of a sensor that sees nothing move."""
-        for row in self._resting.feed(packet):
-            self._rest_sums[0] += int(row["elp"])
-            self._rest_sums[1] += int(row["n_on"] + row["n_off"])
-            self._rest_sums[2] += int(row["end_us"] - row["begin_us"])
-        self._decoder.feed(packet)
+        events = self._decoder.feed(packet)
+        self.resting.add(events.t, events.x, events.y, events.p, packet.complete_until_us)
 
     def armed(self) -> None:
-        """Close the lesson of the resting sensor."""
-        elp, events, us = self._rest_sums
-        if us > 0:
-            self._rest = RestingRate(elp / us, events / us)
+        """Close the lesson of the resting sensor: its rate is known, and hot pixels are not listened to any more."""
+        self._rest = self.resting.settle(self._reference.weights)
+        self._inside &= ~self.resting.hot
+
+    def under_a_lamp(self, lamp: Flicker, speed_um_s: float) -> None:
+        """Judge only whole periods of a lamp that flickers, of a sweep that is slow enough for them."""
+        self._lamp = lamp
+        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        shortest_us = 1e6 * TRAVEL_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um / speed_um_s
+        self._window_us = round(lamp.period_us * np.ceil(shortest_us / lamp.period_us))
+
+    @property
+    def lit(self) -> bool:
+        """Whether the sensor at rest has shown that the scene is in the light: a lamp flickers."""
+        return self._lamp is not None
 
     @property
     def resting_rate_hz(self) -> float:
@@ -175,7 +195,7 @@ class Watch:
     @property
     def resting_events(self) -> int:
         """How many events the resting rate was learnt from."""
-        return self._rest_sums[1]
+        return self.resting.events
 
     def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
         """Begin a direction of travel: everything is judged afresh.
@@ -184,7 +204,10 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry)
+        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot)
+        if self._lamp is not None:
+            self._periods = WholePeriods(self.resting.heard & ~self.resting.hot, at_us)
+            self._undone = np.zeros(self._inside.shape, np.int32)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
@@ -209,7 +232,7 @@ class Watch:
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
-            sample = self._located(row)
+            sample = self._net(self._located(row))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
@@ -236,6 +259,10 @@ class Watch:
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
+        self.rate.add(events.t)
+        if self._periods is not None:
+            self._periods.add(events.t, events.x, events.y, events.p)
+            return
         first, last = np.searchsorted(events.t, [self._begun_us, self._turned_us], side="left")
         part = slice(int(first), int(last))
         self._memory.add(events.t[part], events.x[part], events.y[part], events.p[part])
@@ -260,7 +287,8 @@ class Watch:
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
             return
         self._ticked_um = self._here_um = end_um
-        self._memory.advance(sample.end_us, self._sign * end_um)
+        # Under a lamp a pixel has spoken at some time in the period: at its middle, in the mean.
+        self._memory.advance(sample.end_us, self._sign * (end_um if self._lamp is None else sample.position_um))
 
     @property
     def passed(self) -> bool:
@@ -301,6 +329,10 @@ class Watch:
         if self.decided_us is None:
             return None
         memory = self._memory
+        if self._lamp is not None:
+            vertex, window_um = memory.track.vertex(), 1e-6 * self._window_us * self._settings.speed_um_s
+            seen = [] if vertex is None else [lamp_witness(vertex, self._width_um, window_um)]
+            return self._on_the_ruler(fuse([*self._ask_frames(), *seen]))
         end_us = max(self.decided_us, min(self._turned_us, self._last_us))
         ruler = self._ruler(self._begun_us, end_us)
         if end_us > memory.track.times_us[-1]:
@@ -312,12 +344,22 @@ class Watch:
         speed_um_us = 1e-6 * self._settings.speed_um_s
         unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
-        width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+            for one in said.witnesses(unmeasured_lag_um, unexplained, self._width_um)
         ]
-        found = fuse([*self._ask_frames(), *witnesses])
+        self.flicker = memory.flicker()
+        self.depths_um = tuple(self._sign * at for at in said.depths)
+        frames = [] if said.depths else self._ask_frames()  # of several planes frames show a mixture
+        return self._on_the_ruler(fuse([*frames, *witnesses]))
+
+    @property
+    def _width_um(self) -> float:
+        """The width that the curve of log S has in this optical system."""
+        return WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
+
+    def _on_the_ruler(self, found: FocusEstimate | None) -> FocusEstimate | None:
+        """Turn an estimate on the path of the sweep, which rises, into one on the motor's ruler."""
         if found is None:
             return None
         sign = self._sign
@@ -343,8 +385,22 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
+        if self._periods is not None:
+            self.keep(packet)
         for row in self._windows.feed(packet):
-            self.events_in_cycle += int(row["n_on"] + row["n_off"])
+            sample = self._net(self._located(row))
+            self.events_in_cycle += sample.n_on + sample.n_off
+
+    def return_score(self, focus_um: float) -> float | None:
+        """Return by how many standard deviations the way back undid what the way out from focus had done to the pixels.
+
+        Only under a lamp, where events cannot simply be counted; else ``None``.
+        """
+        if self._periods is None:
+            return None
+        out = self._memory.change_beyond(self._sign * focus_um).astype(np.float64)
+        product = out * self._memory.cut(self._undone)
+        return float(-product.sum() / max(np.sqrt(np.square(product).sum()), 1.0))
 
     def hear_out(self, packet: CameraPacket) -> None:
         """Take a packet after the decision: keep what is still of the sweep, count the rest."""
@@ -353,6 +409,28 @@ class Watch:
         self.count(packet)
 
     # --- pieces ---
+
+    def _net(self, sample: ElpSample) -> ElpSample:
+        """Under a lamp, keep of a window only what whole periods leave; remember that for the estimate."""
+        if self._periods is None:
+            return sample
+        net = self._periods.close(sample.begin_us, sample.end_us)
+        if not self._passed:
+            if sample.begin_us >= self._begun_us:  # else only part of a period was heard
+                self._memory.add(*net)
+        else:
+            np.add.at(self._undone, (net.y, net.x), 2 * net.on.astype(np.int32) - 1)
+        inside = self._inside[net.y, net.x]
+        weight = np.where(inside, self._reference.weights[net.y, net.x], 0).astype(np.int64)
+        sign = 2 * net.on.astype(np.int64) - 1
+        n_on = int(net.on[inside].sum())
+        return replace(
+            sample,
+            elp=-int(sign @ weight),
+            energy=int(weight @ weight),
+            n_on=n_on,
+            n_off=int(inside.sum()) - n_on,
+        )
 
     def _located(self, row: Any) -> ElpSample:
         begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))

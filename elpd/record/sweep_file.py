@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from elpd.focus import guards
 from elpd.records import Direction, FocusEstimate, Outcome
 from elpd.vision.crossing import (
     ROI_MARGIN_PX,
@@ -66,6 +67,9 @@ class Detection:
     events: int = 0
     windows: int = 0
     focus: FocusEstimate | None = None
+    warnings: tuple[str, ...] = ()
+    depths_us: tuple[int, ...] = ()
+    """When the lens passed the focus of each plane of the region, if several were seen, in order."""
 
 
 class SweepSearch:
@@ -215,6 +219,8 @@ class SweepSearch:
         self._attempts_until = self._detector.samples + max(_RETRY_EVERY, self._attempts)
         brightness = None if self._reference is None else self._reference.brightness
         said, self._width = self._memory.witnesses(now_us, self._ruler, brightness)
+        if self._memory.depths:
+            witnesses = []  # of several planes frames show a mixture
         witnesses += said
         estimate = fuse(witnesses)
         if estimate is None:
@@ -249,7 +255,16 @@ class SweepSearch:
             # Without a picture the direction is only known once focus has gone by; and shaking may have misled ELP.
             found = replace(found, direction=Direction.APPROACHING, direction_decided_us=now_us)
         names = ", ".join(f"{name} {weight:.0%}" for name, _, _, weight in estimate.contributions)
-        return replace(found, reason=f"focus was passed; measured by {names}")
+        return self._warned(replace(found, reason=f"focus was passed; measured by {names}"), now_us)
+
+    def _warned(self, found: Detection, now_us: int) -> Detection:
+        """Add what the events of the sweep warn of."""
+        depths_us = tuple(round(self._ruler.time_of(at, now_us)) for at in self._memory.depths)
+        told = guards.of_late_lamp(self._memory.flicker())
+        if depths_us:
+            times = ", ".join(str(one) for one in depths_us)
+            told.append(f"the region holds several depths, in focus at {times} us; the first met is reported")
+        return replace(found, warnings=tuple(told), depths_us=depths_us)
 
     def _on_the_first_way(self, now_us: int) -> bool:
         """Whether the lens has not turned yet: a focus that was passed then lay ahead, whatever ELP said first."""

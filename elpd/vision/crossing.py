@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
+from elpd.vision.depths import find_depths
 from elpd.vision.integral import (
     BANDS_PX,
     MISMATCH,
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from elpd.vision.pairs import Pairs
+
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
@@ -41,6 +44,9 @@ SYSTEMATIC_FRAMES = 0.012
 SYSTEMATIC_VERTEX = 0.08
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
+
+SYSTEMATIC_UNDER_A_LAMP = 0.09
+"""The same for the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
 
 VERTEX_IN_MOTION = 0.12
 """What scene motion adds to the vertex' error, where it strays all pairs."""
@@ -57,6 +63,9 @@ UNMEASURED_LAG_US = 1_500.0
 COARSE_FRAMES = 0.25
 """Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
 
+PERIOD_ERROR = 0.15
+"""How far from the middle of a lamp's period its net events may lie in the mean, in periods."""
+
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
 
@@ -72,6 +81,9 @@ only has to confirm them, and so many pixels are enough for that."""
 
 FLANK = 0.6
 ROI_MARGIN_PX = 14
+
+PLANE_KERNEL = 0.1
+"""Standard deviation, in widths, of the kernel that finds the mode of one plane's pairs among several planes."""
 
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
@@ -140,6 +152,11 @@ class EventWitnesses:
     vertex: Vertex | None
     pairs: Mode | None
     lag: Lag
+    depths: tuple[float, ...] = ()
+    """Where planes of the region are in focus, nearest first along the sweep, if there are several. Then ``pairs`` are
+    those of the first, and there is no vertex: sharpness shows none of them."""
+    plane_width: float = 0.0
+    """Width of one plane's curve, as far as its rising flank tells, where there are several."""
 
     def witnesses(
         self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
@@ -182,7 +199,11 @@ def ask_events(
     weight, slowness = _by_brightness(brightness, events)
     groups = _by_pixel(events)
     at_peak, _ = _rebuilt(events, groups, np.array([peak]))
-    pairs, lag = _pair_mode(events, at_peak[0], peak, end, slowness)
+    found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
+    pairs, lag = _pair_mode(found, at_peak[0], peak, end, slowness)
+    planes = _planes(found, at_peak[0], begin, peak, lag.at * slowness)
+    if planes:
+        return EventWitnesses(None, planes[0], lag, tuple(plane.at for plane in planes), _flank_width(begin, peak))
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
         rows = _busiest_rows(events)
         events, weight, slowness = _rows_of(events, rows), weight[rows], slowness[rows]
@@ -261,6 +282,15 @@ def frame_witness(vertex: Vertex, spacing: float) -> Witness:
     return Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * coarseness * vertex.width)))
 
 
+def lamp_witness(vertex: Vertex, width: float, spacing: float) -> Witness:
+    """Return what the curve of whole lamp periods says, one point every *spacing*, dated to the periods' middle.
+
+    A lamp that is seen at all dithers the comparators: there is no dead zone to correct for.
+    """
+    sigma = float(np.hypot(vertex.sigma, SYSTEMATIC_UNDER_A_LAMP * width))
+    return Witness("vertex", vertex.at, sigma, PERIOD_ERROR * spacing)
+
+
 def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     """Return the least-squares mean under the witnesses' joint covariance.
 
@@ -311,10 +341,8 @@ def _rebuilt(
 
 
 def _pair_mode(
-    events: EventStretch, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
+    pairs: Pairs, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
 ) -> tuple[Mode | None, Lag]:
-    shape = (events.height, events.width)
-    pairs = find_pairs(events.t_us, events.x, events.y, events.on, events.position, shape)
     if pairs.on.size == 0:
         return None, Lag()
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
@@ -328,6 +356,27 @@ def _pair_mode(
     if mode is None or not slowness.any():
         return mode, Lag()
     return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past)
+
+
+def _flank_width(begin: float, peak: float) -> float:
+    """Return the width of a curve that rose by ``FLANK`` from *begin* to *peak*."""
+    return (peak - begin) / float(np.sqrt(2.0 * FLANK))
+
+
+def _planes(
+    pairs: Pairs, level: NDArray[np.float32], begin: float, peak: float, late: NDArray[np.float64]
+) -> list[Mode]:
+    """Return where planes of the region are in focus, if there are several; *late* is each pixel's lag."""
+    width = _flank_width(begin, peak)
+    curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
+    middle = pairs.middle - late[pairs.y, pairs.x]
+    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (middle >= begin - width)
+    weights = (np.abs(curvature) / np.maximum(pairs.after - pairs.before, 1e-3 * width))[believed]
+    middle = middle[believed]
+    clusters = find_depths(middle, weights, pairs.x[believed], pairs.y[believed], width)
+    held = sum(float(weights[one].sum()) for one in clusters) / max(float(weights.sum()), 1e-300)
+    modes = [weighted_mode(middle[one], weights[one], PLANE_KERNEL * width) for one in clusters]
+    return [replace(mode, share=held) for mode in modes if mode is not None]
 
 
 def without_lag(

@@ -15,6 +15,7 @@ import numpy as np
 
 from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
+from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from elpd.records import Geometry, Roi
     from elpd.vision.crossing import EventWitnesses, Witness
+    from elpd.vision.flicker import Flicker
     from elpd.vision.ruler import Ruler
 
 MIN_EVENTS = 1_000
@@ -55,9 +57,13 @@ class EventMemory:
         Where to focus, and on what sensor.
     max_events:
         How many are kept.
+    hot:
+        (height, width) of the sensor: pixels not to listen to.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS) -> None:
+    def __init__(
+        self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS, hot: NDArray[np.bool_] | None = None
+    ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
@@ -71,12 +77,17 @@ class EventMemory:
         self._max_events = max_events
         self.track = PeakTrack()
         self._forgotten = 0
+        self._hot = None if hot is None or not hot.any() else hot
         self.capped = 0
+        self.depths: tuple[float, ...] = ()
+        """Where planes of the region are in focus, nearest first along the sweep, if ``witnesses`` found several."""
         self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
         inside = (x >= self._left) & (x < self._right) & (y >= self._top) & (y < self._bottom)
+        if self._hot is not None:
+            inside &= ~self._hot[y, x]
         t_us, on = t_us[inside], on[inside]
         x = (x[inside] - self._left).astype(np.uint16)
         y = (y[inside] - self._top).astype(np.uint16)
@@ -105,6 +116,20 @@ class EventMemory:
         self._taken -= drop
         self._forgotten += drop
 
+    def cut(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of an image of the whole sensor that is remembered here."""
+        return image[self._top : self._bottom, self._left : self._right]
+
+    def change_beyond(self, position: float) -> NDArray[np.int32]:
+        """Return by how many events each pixel's level changed since the curve passed *position*, (height, width)."""
+        beyond = np.flatnonzero(np.array(self.track.positions) >= position)
+        since_us = self.track.times_us[int(beyond[0])] if beyond.size else self.track.times_us[-1]
+        part = slice(int(np.searchsorted(self._t_us, since_us, side="left")), self._count)
+        _, x, y, on = self._columns
+        change = np.zeros(self._shape, np.int32)
+        np.add.at(change, (y[part], x[part]), 2 * on[part].astype(np.int32) - 1)
+        return change
+
     @property
     def _t_us(self) -> NDArray[np.int64]:
         times: NDArray[np.int64] = self._columns[0][: self._count]
@@ -114,6 +139,13 @@ class EventMemory:
         """Return how long a pixel is deaf after an event, as far as the events tell."""
         t_us, x, y, _ = (column[: self._count] for column in self._columns)
         return refractory_period(t_us, x, y, self._shape)
+
+    def flicker(self) -> Flicker | None:
+        """Return a lamp's flicker, if the events show one."""
+        if self._count == 0:
+            return None
+        t_us, on = self._t_us, self._columns[3][: self._count]
+        return find_flicker(t_us, on, int(t_us[0]), int(t_us[-1]) + 1)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
@@ -176,11 +208,14 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
         said = self.ask(now_us, ruler, brightness)
-        if said is None or said.vertex is None:
+        self.depths = ()
+        if said is None or (said.vertex is None and not said.depths):
             return [], None
         _, _, sign = ruler.stretch(now_us)
         lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
-        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)], said.vertex.width
+        self.depths = tuple(sign * at for at in said.depths)
+        width = said.plane_width if said.vertex is None else said.vertex.width
+        return [replace(one, at=sign * one.at) for one in said.witnesses(lag, width=width)], width
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:

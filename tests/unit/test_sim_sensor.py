@@ -5,6 +5,7 @@ from __future__ import annotations
 import naive_sim
 import numpy as np
 import pytest
+from elpd_drivers.sim.optics import Lamp
 from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
 from elpd_drivers.sim.sensor import MISMATCH_STEP, EventSensor
 from elpd_drivers.sim.world import random_stream
@@ -216,7 +217,7 @@ def test_hot_pixels_fire_and_can_be_masked() -> None:
 
 
 def test_flicker_and_cap() -> None:
-    flickering = Setup(light={"flicker_hz": 100.0, "flicker_depth": 0.3}, sensor=QUIET).run(0.1)
+    flickering = Setup(light={"lamp": Lamp(100.0, 0.3)}, sensor=QUIET).run(0.1)
     rate, _ = np.histogram(flickering["t"], np.arange(20_000, 100_001, 5_000))
     assert rate.min() > 0
     capped = Setup(Ramp(begin_s=0.01), light={"cap": True}, sensor=QUIET).run(0.1)

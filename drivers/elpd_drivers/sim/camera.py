@@ -10,7 +10,7 @@ size, a counted gap.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -81,6 +81,28 @@ class CameraFaults:
 
 
 @dataclass(frozen=True, slots=True)
+class RateLimit:
+    """What leaves the sensor at most, in events per microsecond; 0 for no limit. ``told``: the sensor counts the rest.
+
+    Like a rate controller it thins evenly within a packet's time.
+    """
+
+    mev_s: float = 0.0
+    told: bool = True
+
+    def thinned(self, events: Events) -> Events:
+        """Return what is left of a packet's events."""
+        most, count = round(self.mev_s * FLUSH_US), len(events.t_us)
+        if most == 0 or count <= most:
+            return events
+        kept = np.arange(most) * count // most
+        lost = events.lost + (count - most if self.told else 0)
+        return replace(
+            events, t_us=events.t_us[kept], x=events.x[kept], y=events.y[kept], on=events.on[kept], lost=lost
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class _Sent:
     arrival_ns: int
     data: NDArray[Any]
@@ -116,6 +138,7 @@ class SimulatedCamera:
         frames: ApsFrames | None = None,
         mask_slots: int = 64,
         ring_packets: int = RING_PACKETS,
+        rate_limit: RateLimit | None = None,
         faults: CameraFaults | None = None,
     ) -> None:
         self._clock = clock
@@ -128,6 +151,7 @@ class SimulatedCamera:
         self._frames = frames
         self._mask_slots = mask_slots
         self._ring_packets = ring_packets
+        self._rate_limit = rate_limit or RateLimit()
         self._faults = faults or CameraFaults()
         self._ring: deque[_Sent] = deque()
         self._pending: list[tuple[int, Callable[[], None]]] = []
@@ -224,7 +248,7 @@ class SimulatedCamera:
         for change in due:
             change()
         begin_us, end_us = flush * FLUSH_US, (flush + 1) * FLUSH_US
-        events = self._retina.expose(begin_us, end_us)
+        events = self._rate_limit.thinned(self._retina.expose(begin_us, end_us))
         events.t_us[:] += self._origin_us
         data = self._wire.encode(events, begin_us + self._origin_us, end_us + self._origin_us)
         frames = () if self._frames is None else self._frames.take(end_us, self._origin_us)

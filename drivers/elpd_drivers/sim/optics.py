@@ -10,6 +10,7 @@ a shift by Catmull-Rom interpolation; bilinear would blur with the sub-pixel pha
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,16 +18,17 @@ import cv2
 import numpy as np
 
 from elpd.events.jit import kernel
+from elpd.records import Roi
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from elpd.records import Roi
     from elpd_drivers.sim.aperture import SimulatedAperture
     from elpd_drivers.sim.motion import SceneMotion
 
+LAMP_SHAPES = ("sine", "pwm")
 SIGMA0_PX = 0.35
 BLUR_PX_PER_DEPTH = 0.0233 * 6.0
 """Blur in px at one depth of focus from focus (0.0233 px/um at a depth of focus of 6 um)."""
@@ -125,6 +127,12 @@ class DefocusStack:
         self._widest = _spread(linear, float(self.ladder_px2[0]))
         self._logs = [self._log(self._widest)]
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of the images, margin included."""
+        height, width = self._widest.shape
+        return height, width
+
     def bracket(self, sigma2_px2: float) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
         """Return the log images around a blur and the weight of the second. Clamped at the ladder's ends."""
         index = int(np.searchsorted(self.ladder_px2, sigma2_px2, side="right")) - 1
@@ -154,6 +162,14 @@ def _spread(image: NDArray[np.float32], variance_px2: float) -> NDArray[np.float
     return np.asarray(blurred, np.float32)
 
 
+class LayerCondition(NamedTuple):
+    """Blur and place of one layer at one instant."""
+
+    sigma2_px2: float
+    shift_x_px: float
+    shift_y_px: float
+
+
 class Condition(NamedTuple):
     """All that the picture on the sensor depends on, at one instant. Equal conditions give equal pictures."""
 
@@ -161,6 +177,37 @@ class Condition(NamedTuple):
     shift_x_px: float
     shift_y_px: float
     light: float
+    layers: tuple[LayerCondition, ...] = ()
+    magnification: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """A rectangle of another picture before the scene: at another depth, or moving by itself.
+
+    ``box`` is (x, y, width, height) in pixels of the sensor while nothing moves. The picture moves with its box.
+    """
+
+    stack: DefocusStack
+    box: tuple[int, int, int, int]
+    focus_offset_um: float = 0.0
+    velocity_px_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """A lamp that varies by ± ``depth`` at ``hz``: a sine, or ``pwm`` (on and off, half of the time each)."""
+
+    hz: float = 0.0
+    depth: float = 0.1
+    shape: str = "sine"
+
+    def light(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return its light at the given instants, relative to its mean."""
+        if self.hz <= 0:
+            return np.ones(len(times_ns))
+        wave = np.sin(2e-9 * np.pi * self.hz * times_ns)
+        return 1 + self.depth * (np.where(wave >= 0, 1.0, -1.0) if self.shape == "pwm" else wave)
 
 
 class LightField:
@@ -174,10 +221,14 @@ class LightField:
         The carriage position of true focus.
     margin_px
         How much larger the stack's images are than the sensor, on each side.
-    flicker_hz, flicker_depth
-        A lamp that varies sinusoidally by ± depth; 0 Hz for none.
+    lamp
+        What lights the scene.
     cap
         The lens cap is on.
+    layers
+        What stands before the scene, each on top of those before it.
+    breathing_per_mm
+        Relative change of the magnification with the lens's travel away from focus.
     """
 
     def __init__(
@@ -190,9 +241,10 @@ class LightField:
         aperture: SimulatedAperture | None,
         depth_of_focus_um: float,
         margin_px: int,
-        flicker_hz: float = 0.0,
-        flicker_depth: float = 0.1,
+        lamp: Lamp | None = None,
         cap: bool = False,
+        layers: tuple[Layer, ...] = (),
+        breathing_per_mm: float = 0.0,
     ) -> None:
         self._stack = stack
         self._carriage_um = carriage_um
@@ -201,28 +253,40 @@ class LightField:
         self._aperture = aperture
         self._px_per_um = BLUR_PX_PER_DEPTH / depth_of_focus_um
         self._margin_px = margin_px
-        self._flicker_hz = flicker_hz
-        self._flicker_depth = flicker_depth
+        height, width = stack.shape
+        self._centre_px = (width / 2 - margin_px, height / 2 - margin_px)
+        self._lamp = lamp or Lamp()
         self._cap = cap
+        self._layers = layers
+        self._breathing_per_um = 1e-3 * breathing_per_mm
 
     def conditions(self, times_ns: NDArray[np.int64]) -> list[Condition]:
         """Return what holds at each of the given instants."""
-        defocus2 = (self._px_per_um * (self._carriage_um(times_ns) - self._focus_um)) ** 2
         light = np.ones(len(times_ns)) if self._aperture is None else self._aperture.transmittance_at(times_ns)
-        sigma2 = SIGMA0_PX**2 + defocus2 * light
-        if self._cap:
-            light = np.zeros_like(light)
-        if self._flicker_hz > 0:
-            light = light * (1 + self._flicker_depth * np.sin(2e-9 * np.pi * self._flicker_hz * times_ns))
-        shifts = [self._motion.displacement_px(int(t) / 1e3) for t in times_ns]
-        return [Condition(float(s), *d, float(q)) for s, d, q in zip(sigma2, shifts, light, strict=True)]
+        lit = np.zeros_like(light) if self._cap else light * self._lamp.light(times_ns)
+        places = self._carriage_um(times_ns) - self._focus_um
+        return [
+            self._condition(int(t), float(um), float(open_), float(q))
+            for t, um, open_, q in zip(times_ns, places, light, lit, strict=True)
+        ]
 
     def wide_open(self, when_ns: int) -> Condition:
         """Return what holds at an instant behind a fully open aperture, under a lamp that does not flicker."""
-        carriage_um = self._carriage_um(np.array([when_ns], np.int64))[0]
-        sigma2_px2 = SIGMA0_PX**2 + (self._px_per_um * (carriage_um - self._focus_um)) ** 2
+        carriage_um = float(self._carriage_um(np.array([when_ns], np.int64))[0])
+        return self._condition(when_ns, carriage_um - self._focus_um, 1.0, 0.0 if self._cap else 1.0)
+
+    def _condition(self, when_ns: int, defocus_um: float, transmittance: float, light: float) -> Condition:
         shift_x_px, shift_y_px = self._motion.displacement_px(when_ns / 1e3)
-        return Condition(float(sigma2_px2), shift_x_px, shift_y_px, 0.0 if self._cap else 1.0)
+
+        def sigma2_px2(offset_um: float) -> float:
+            return float(SIGMA0_PX**2 + (self._px_per_um * (defocus_um - offset_um)) ** 2 * transmittance)
+
+        layers = tuple(
+            LayerCondition(sigma2_px2(one.focus_offset_um), shift_x_px + 1e-9 * when_ns * one.velocity_px_s, shift_y_px)
+            for one in self._layers
+        )
+        magnification = 1.0 + self._breathing_per_um * defocus_um
+        return Condition(sigma2_px2(0.0), shift_x_px, shift_y_px, light, layers, magnification)
 
     def steps_needed(self, conditions: list[Condition]) -> int:
         """Say into how many pieces the time spanned by *conditions* must be cut for the picture to change evenly."""
@@ -240,17 +304,50 @@ class LightField:
         if condition.light <= 0:
             out.fill(np.log(DARK))
             return
-        a, b, weight = self._stack.bracket(condition.sigma2_px2)
-        top = self._margin_px + window.y - condition.shift_y_px
-        left = self._margin_px + window.x - condition.shift_x_px
-        row, column = int(np.floor(top)), int(np.floor(left))
-        scratch = np.empty(window.width + 3, np.float32)
-        blend_shifted(
-            a, b, np.float32(weight), row, column, np.float32(top - row), np.float32(left - column), scratch, out
-        )
+        self._lay(self._stack, LayerCondition(*condition[:3]), window, out)
+        for layer, place in zip(self._layers, condition.layers, strict=True):
+            self._stand_before(layer, place, window, out)
+        if condition.magnification != 1.0:
+            _magnify(out, condition.magnification, window, self._centre_px)
         if condition.light != 1.0:
             for rows in np.array_split(out, max(1, out.size // CACHED_PIXELS)):
                 np.exp(rows, out=rows)
                 rows *= np.float32(condition.light)
                 rows += np.float32(DARK * (1 - condition.light))
                 np.log(rows, out=rows)
+
+    def _lay(self, stack: DefocusStack, place: LayerCondition, window: Roi, out: NDArray[np.float32]) -> None:
+        a, b, weight = stack.bracket(place.sigma2_px2)
+        top = self._margin_px + window.y - place.shift_y_px
+        left = self._margin_px + window.x - place.shift_x_px
+        row, column = int(np.floor(top)), int(np.floor(left))
+        scratch = np.empty(window.width + 3, np.float32)
+        blend_shifted(
+            a, b, np.float32(weight), row, column, np.float32(top - row), np.float32(left - column), scratch, out
+        )
+
+    def _stand_before(self, layer: Layer, place: LayerCondition, window: Roi, out: NDArray[np.float32]) -> None:
+        """Cover what the layer's box covers; a box that moves comes back on the other side."""
+        x, y, width, height = layer.box
+        drift_px, part_px = 0, place.shift_x_px  # what stands still is a window onto a picture that may shake
+        if layer.velocity_px_s:
+            shift_px = (x + width + place.shift_x_px) % (2 * self._centre_px[0] + width) - width - x
+            drift_px, part_px = round(shift_px), shift_px - round(shift_px)
+        left, top = max(x + drift_px, window.x), max(y, window.y)
+        right = min(x + drift_px + width, window.x + window.width)
+        bottom = min(y + height, window.y + window.height)
+        if left >= right or top >= bottom:
+            return
+        picture = np.empty((bottom - top, right - left), np.float32)
+        # The picture goes with the box, so the cut in it is where the box would be without the drift.
+        cut = Roi(left - drift_px, top, right - left, bottom - top)
+        self._lay(layer.stack, place._replace(shift_x_px=part_px), cut, picture)
+        out[top - window.y : bottom - window.y, left - window.x : right - window.x] = picture
+
+
+def _magnify(out: NDArray[np.float32], magnification: float, window: Roi, centre_px: tuple[float, float]) -> None:
+    """Enlarge the picture about the sensor's centre, in place; what comes from outside the window is its border."""
+    x, y = centre_px[0] - window.x, centre_px[1] - window.y
+    affine = np.array([[magnification, 0.0, x * (1 - magnification)], [0.0, magnification, y * (1 - magnification)]])
+    size = (out.shape[1], out.shape[0])
+    out[:] = cv2.warpAffine(out, affine, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FORGOTTEN_US = 20_000
 BANDWIDTH_EVERY_US = 4_000
+OVEREXPOSED = 0.01
 
 
 class Retina:
@@ -100,7 +101,7 @@ class ApsFrames:
     """Grey frames at a fixed rate, from the light that fell during each exposure.
 
     Linear in light, 8 bit, black level 4, with shot and read noise; the gain is set once, from the first frame, so
-    that its brightest per cent just does not clip. Pixels outside the event window stay black.
+    that a given share of it clips. Pixels outside the event window stay black.
     """
 
     PERIOD_US = 20_000
@@ -110,7 +111,8 @@ class ApsFrames:
     READ_NOISE = 0.6
     FULL_WELL_ELECTRONS = 12_000.0
 
-    def __init__(self, width: int, height: int, chance: np.random.Generator) -> None:
+    def __init__(self, width: int, height: int, chance: np.random.Generator, overexposed: float = OVEREXPOSED) -> None:
+        self._overexposed = overexposed
         self._chance = chance
         self._sum = np.zeros((height, width), np.float32)
         self._weight_us = 0
@@ -141,7 +143,7 @@ class ApsFrames:
         self._sum.fill(0)
         self._weight_us = 0
         if self._gain is None:
-            self._gain = 240.0 / max(float(np.percentile(mean, 99)), 1e-3)
+            self._gain = 240.0 / max(float(np.percentile(mean, 100 * (1 - self._overexposed))), 1e-3)
         grey = np.maximum(mean * self._gain, 0)
         electrons_per_grey = self.FULL_WELL_ELECTRONS / 255
         noise_sd = np.sqrt(self.READ_NOISE**2 + grey / electrons_per_grey)

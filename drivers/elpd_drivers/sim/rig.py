@@ -23,14 +23,14 @@ from elpd.records import Encoding, Geometry, Roi
 from elpd.scale import LensScale
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
-from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, SimulatedCamera, Wire
+from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from elpd_drivers.sim.motion import SceneMotion
-from elpd_drivers.sim.optics import DefocusStack, LightField
-from elpd_drivers.sim.retina import ApsFrames, Retina
+from elpd_drivers.sim.optics import LAMP_SHAPES, DefocusStack, Lamp, Layer, LightField
+from elpd_drivers.sim.retina import OVEREXPOSED, ApsFrames, Retina
 from elpd_drivers.sim.scene import choose_scene, scene_canvas
-from elpd_drivers.sim.sensor import FOCUS, BiasLevels, EventSensor
+from elpd_drivers.sim.sensor import FOCUS, HOT_PIXEL_HZ, BiasLevels, EventSensor
 from elpd_drivers.sim.world import World, random_stream
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ INTERPOLATION_PX = 3
 ROOM_UM = 300.0
 CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
 MASK_SLOTS = {"evk4": 64, "davis346": 8}
+OBJECT_SCENE = "gravel"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +58,15 @@ class SimSettings:
     ``start_um`` is where the lens begins, relative to true focus. ``scene`` is a name or ``random``, one of the natural
     pictures by seed. ``speed_um_s`` is what the sweep is meant to run at; the lens allows three times as much.
     ``width`` and ``height`` shrink the sensor; 0 is the camera's own size. Rates are per pixel; ``brightness`` scales
-    the light, and with it photoreceptor lag and shot noise. The ``camera_*``, ``drop_*`` and ``aperture_stuck`` or
-    ``_slow`` keys inject faults, in seconds after the camera's start. ``cam`` makes the image move by 1 ± that many
-    times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner believes in.
+    the light, and with it photoreceptor lag and shot noise. ``cam`` makes the image move by 1 ± that many times as much
+    as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner believes in.
+
+    Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
+    from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
+    half of the picture is in focus so much further along the travel. With ``object_px_s`` a textured square, in the
+    scene's plane, goes across it. ``overexposed`` is the share of a frame's pixels that clip. Events beyond
+    ``rate_limit_mev_s`` do not leave the sensor, which says so (``rate_limit_told``) or not. The ``camera_*``,
+    ``drop_*`` and ``aperture_stuck`` or ``_slow`` keys inject faults, in seconds after the camera's start.
     """
 
     seed: int = 0
@@ -78,10 +85,21 @@ class SimSettings:
     brightness: float = 1.0
     flicker_hz: float = 0.0
     flicker_depth: float = 0.1
+    flicker_shape: str = "sine"
+    # scene
+    pan_px_s: float = 0.0
+    pan_deg: float = 0.0
+    breathing_per_mm: float = 0.0
+    second_plane_um: float = 0.0
+    object_px_s: float = 0.0
     # sensor
     noise_hz: float = 1.0
     leak_hz: float = 0.1
     hot_pixels: int = 0
+    hot_pixel_hz: float = HOT_PIXEL_HZ
+    overexposed: float = OVEREXPOSED
+    rate_limit_mev_s: float = 0.0
+    rate_limit_told: bool = True
     contrast_on: float = FOCUS.c_on
     contrast_off: float = FOCUS.c_off
     refractory_us: int = FOCUS.refractory_us
@@ -237,17 +255,21 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     lens, port = _lens(chosen, world, mechanism)
     aperture = _aperture(chosen, world) if chosen.camera == "evk4" else None
     scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
+    stack = _stack(scene, geometry, chosen.brightness)
+    heading = np.deg2rad(chosen.pan_deg)
+    pan_px_s = (float(chosen.pan_px_s * np.cos(heading)), float(chosen.pan_px_s * np.sin(heading)))
     light = LightField(
-        DefocusStack(scene_canvas(scene, geometry.width, geometry.height, MARGIN_PX), chosen.brightness),
+        stack,
         lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)),
         float(cam.image_um(np.float64(focus_um))),
-        SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX),
+        SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX, pan_px_s),
         aperture=aperture,
         depth_of_focus_um=chosen.depth_of_focus_um,
         margin_px=MARGIN_PX,
-        flicker_hz=chosen.flicker_hz,
-        flicker_depth=chosen.flicker_depth,
+        lamp=Lamp(chosen.flicker_hz, chosen.flicker_depth, chosen.flicker_shape),
         cap=chosen.cap,
+        layers=_layers(chosen, stack, geometry),
+        breathing_per_mm=chosen.breathing_per_mm,
     )
     truth = SimulatedTruth(
         world=world,
@@ -265,6 +287,23 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, scale, truth)
 
 
+def _stack(scene: str, geometry: Geometry, brightness: float) -> DefocusStack:
+    return DefocusStack(scene_canvas(scene, geometry.width, geometry.height, MARGIN_PX), brightness)
+
+
+def _layers(chosen: SimSettings, stack: DefocusStack, geometry: Geometry) -> tuple[Layer, ...]:
+    """Return what stands before the scene: its own right half at another depth, an object that goes by."""
+    width, height = geometry.width, geometry.height
+    layers = []
+    if chosen.second_plane_um:
+        layers.append(Layer(stack, (width // 2, 0, width - width // 2, height), chosen.second_plane_um))
+    if chosen.object_px_s:
+        side = height // 3
+        own = _stack(OBJECT_SCENE, geometry, chosen.brightness)
+        layers.append(Layer(own, (0, (height - side) // 2, side, side), velocity_px_s=chosen.object_px_s))
+    return tuple(layers)
+
+
 def _geometry(chosen: SimSettings) -> Geometry:
     if chosen.camera not in CAMERAS:
         raise ConfigError(f"sim.camera is {chosen.camera!r}; known: {', '.join(CAMERAS)}")
@@ -277,6 +316,13 @@ def _geometry(chosen: SimSettings) -> Geometry:
         )
     if chosen.depth_of_focus_um <= 0 or chosen.brightness <= 0:
         raise ConfigError("sim.depth_of_focus_um and sim.brightness must be more than 0; use sim.cap for darkness")
+    if chosen.flicker_shape not in LAMP_SHAPES or not 0 <= chosen.flicker_depth <= 1:
+        raise ConfigError(
+            f"sim.flicker_shape is {chosen.flicker_shape!r}, sim.flicker_depth {chosen.flicker_depth:g}; known shapes: "
+            f"{', '.join(LAMP_SHAPES)}; the depth lies between 0 and 1"
+        )
+    if not 0 < chosen.overexposed < 1 or chosen.rate_limit_mev_s < 0:
+        raise ConfigError("sim.overexposed lies between 0 and 1, sim.rate_limit_mev_s is 0 (none) or more")
     return geometry
 
 
@@ -332,11 +378,12 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         noise_hz=chosen.noise_hz / chosen.brightness,
         leak_hz=chosen.leak_hz,
         hot_pixels=chosen.hot_pixels,
+        hot_pixel_hz=chosen.hot_pixel_hz,
         focus=BiasLevels(chosen.contrast_on, chosen.contrast_off, chosen.refractory_us),
         memories=chosen.memories,
     )
     davis = chosen.camera == "davis346"
-    frames = ApsFrames(width, height, random_stream(seed, "frames")) if davis else None
+    frames = ApsFrames(width, height, random_stream(seed, "frames"), chosen.overexposed) if davis else None
     wire: Wire = ArrayWire() if davis else Evt3Wire(width)
     born_ns = world.now_ns()
     return SimulatedCamera(
@@ -350,6 +397,7 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         frames=frames,
         mask_slots=MASK_SLOTS[chosen.camera],
         ring_packets=chosen.ring_packets,
+        rate_limit=RateLimit(chosen.rate_limit_mev_s, told=chosen.rate_limit_told),
         faults=CameraFaults(
             chosen.camera_vanishes_at_s, chosen.camera_silent_from_s, chosen.drop_from_s, chosen.drop_for_s
         ),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PICTURES = ("astronaut", "brick", "camera", "chelsea", "coffee", "grass", "gravel", "rocket")
-SYNTHETIC = ("flat", "edges", "siemens")
+SYNTHETIC = ("flat", "edges", "bars", "siemens")
 NAMES = (*PICTURES, *SYNTHETIC)
 RANDOM = "random"
 FLOOR = 0.003
@@ -73,6 +73,10 @@ def _synthetic(name: str, width: int, height: int) -> NDArray[np.float32]:
     y, x = np.mgrid[:height, :width].astype(np.float64)
     if name == "flat":
         return np.full((height, width), 0.2, np.float32)
+    if name == "bars":
+        # Vertical bars only: a shift along them changes nothing, one across them looks like a change of blur.
+        bars = 0.05 + 0.4 * (np.floor(x / 24) % 2) + 0.3 * (np.floor(x / 37) % 2) + 0.1 * (np.floor(x / 7) % 2)
+        return np.asarray(bars, np.float32)
     if name == "edges":
         # Vertical bars of several widths and contrasts over horizontal ones: step edges in both directions.
         picture = 0.2 + 0.15 * (np.floor(x / 24) % 2) + 0.08 * (np.floor(y / 40) % 2) + 0.05 * (np.floor(x / 7) % 2)

@@ -95,6 +95,7 @@ class EventSensor:
         noise_hz: float = 1.0,
         leak_hz: float = 0.1,
         hot_pixels: int = 0,
+        hot_pixel_hz: float = HOT_PIXEL_HZ,
         focus: BiasLevels = FOCUS,
         memories: bool = True,
     ) -> None:
@@ -104,6 +105,7 @@ class EventSensor:
         self._chance = chance
         self._noise_hz = noise_hz
         self._leak_hz = leak_hz
+        self._hot_pixel_hz = hot_pixel_hz
         self._unsettled_since_us = -NEVER_US
         self._unsettled = False
         unit = MISMATCH_SD / MISMATCH_STEP
@@ -262,7 +264,7 @@ class EventSensor:
         kinds = np.repeat(np.array([NEAREST, ON], np.uint8), [noise, leak])
         hot = [(y - self.window.y) * self.window.width + x - self.window.x for x, y in self.hot if self._inside(x, y)]
         if hot:
-            bursts = chance.poisson(HOT_PIXEL_HZ * span_us * 1e-6, len(hot))
+            bursts = chance.poisson(self._hot_pixel_hz * span_us * 1e-6, len(hot))
             which = np.concatenate([which, np.repeat(hot, bursts)])
             kinds = np.concatenate([kinds, np.full(int(bursts.sum()), ON, np.uint8)])
         times = begin_us + chance.integers(span_us, size=len(which))

@@ -1,0 +1,135 @@
+"""Whether the light flickers, at what frequency, and whether it leaves anything behind.
+
+A lamp that flickers makes all lit pixels fire ON together and OFF together, so the difference of ON and OFF events
+swings with the lamp, while a lens or an edge that moves makes about as many of one kind as of the other. The test is a
+periodogram of that difference in bins of a quarter of a millisecond. If the signs of events were independent, its
+ordinates, over the number of events, would be exponential with mean one; motion makes them larger, so they are judged
+against their own median. With M independent frequencies a line is found by chance with a probability below
+``M·exp(-P)``; a line counts where that is below ``FALSE_ALARM`` *and* it carries a good share of all events, because
+a lamp that moves few pixels harms nobody.
+
+What a lamp does to a pixel's level is undone after a whole period, whatever its depth, as long as the pixel can follow.
+So sums over whole periods are free of it; ``residue`` says how well that holds for this sensor and this lamp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BIN_US = 250
+"""Lamps of up to 1 kHz have four bins a period; a faster one is averaged away by the photoreceptors."""
+
+HIGHEST_HZ = 1_000.0
+LOWEST_HZ = 45.0
+FEWEST_PERIODS = 2.0
+
+FALSE_ALARM = 1e-6
+"""How often light that does not flicker may be taken for light that does."""
+
+LEAST_SHARE = 0.3
+"""Amplitude of the swing over the rate of events: one where all events are the lamp's, a few hundredths in scenes that
+move."""
+
+NEARLY = 0.5
+"""Power of a line over that of the highest from which on the lower frequency is believed."""
+
+STEPS_PER_RESOLUTION = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Flicker:
+    """A lamp's frequency, the share of events that swing with it, and the probability to see as much by chance."""
+
+    frequency_hz: float
+    share: float
+    false_alarm: float
+
+    @property
+    def period_us(self) -> float:
+        """How long one period lasts."""
+        return 1e6 / self.frequency_hz
+
+
+def find_flicker(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end_us: int) -> Flicker | None:
+    """Return the strongest line in the events of ``[begin_us, end_us)``, or ``None`` if there is none.
+
+    Parameters
+    ----------
+    t_us, on:
+        Times and polarities (1 or 0); order does not matter.
+
+    """
+    bins = (end_us - begin_us) // BIN_US
+    if bins < 8:
+        return None
+    span_s = 1e-6 * BIN_US * bins
+    inside = (t_us >= begin_us) & (t_us < begin_us + bins * BIN_US)
+    which, sign = (t_us[inside] - begin_us) // BIN_US, 2.0 * on[inside] - 1.0
+    count = np.bincount(which, minlength=bins).astype(np.float64)
+    if count.sum() < 2.0 / LEAST_SHARE**2:
+        return None
+    mean = float(sign.mean())
+    swing = np.bincount(which, weights=sign, minlength=bins) - mean * count
+    taper = np.sin(np.pi * (np.arange(bins) + 0.5) / bins) ** 2
+    lowest = max(LOWEST_HZ, FEWEST_PERIODS / span_s)
+    if lowest >= HIGHEST_HZ:
+        return None
+    independent = max(1.0, (HIGHEST_HZ - lowest) * span_s)
+    frequencies = np.linspace(lowest, HIGHEST_HZ, int(STEPS_PER_RESOLUTION * independent) + 2)
+    turns = np.exp(-2j * np.pi * 1e-6 * BIN_US * np.outer(frequencies, np.arange(bins)))
+    amplitude = np.abs(turns @ (taper * swing))
+    variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
+    power = amplitude**2 / max(variance, 1e-12)
+    power /= max(1.0, float(np.median(power)) / np.log(2.0))
+    top = _lowest_line(power)
+    false_alarm = float(min(1.0, independent * np.exp(-power[top])))
+    share = float(2.0 * amplitude[top] / max(float(taper @ count), 1e-12))
+    if false_alarm > FALSE_ALARM or share < LEAST_SHARE:
+        return None
+    return Flicker(_refined(frequencies, power, top), min(share, 1.0), false_alarm)
+
+
+def _lowest_line(power: NDArray[np.float64]) -> int:
+    """Return the top of the lowest line nearly as high as the highest.
+
+    A lamp has harmonics, and where events are stamped by a coarse clock, mirror images of its line.
+    """
+    first = int(np.flatnonzero(power >= NEARLY * power.max())[0])
+    while first + 1 < power.size and power[first + 1] > power[first]:
+        first += 1
+    return first
+
+
+def _refined(frequencies: NDArray[np.float64], power: NDArray[np.float64], top: int) -> float:
+    """Return where the parabola through the highest ordinate and its neighbours peaks."""
+    if not 0 < top < power.size - 1:
+        return float(frequencies[top])
+    before, here, after = (float(one) for one in power[top - 1 : top + 2])
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float(frequencies[top] + shift * (frequencies[1] - frequencies[0]))
+
+
+def residue(
+    t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], flicker: Flicker, end_us: int
+) -> float:
+    """Return what whole periods leave behind: the mean square, in thresholds², of a pixel's level change over them.
+
+    As many whole periods as the events before *end_us* (in time order) hold, over pixels that fired in that time. What
+    a pixel's comparator holds back alone makes up to about one.
+    """
+    if t_us.size == 0:
+        return 0.0
+    periods = int((end_us - int(t_us[0])) / flicker.period_us)
+    within = t_us >= end_us - periods * flicker.period_us
+    if periods == 0 or not within.any():
+        return 0.0
+    fired, index = np.unique(pixel[within], return_inverse=True)
+    net = np.bincount(index, weights=2.0 * on[within] - 1.0, minlength=fired.size)
+    return float(np.square(net).mean())

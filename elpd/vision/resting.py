@@ -1,0 +1,182 @@
+"""What a sensor says while lens and scene rest: its noise, its hot pixels, and whether the light flickers.
+
+A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
+than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
+told from a hand that shakes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from elpd.vision.crossing import ROI_MARGIN_PX
+from elpd.vision.detector import RestingRate
+from elpd.vision.flicker import find_flicker, residue
+from elpd.vision.whole_periods import WholePeriods
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from elpd.records import Geometry, Roi
+    from elpd.vision.flicker import Flicker
+
+LISTEN_MS = 35.0
+"""How much longer to listen where a lamp is suspected: four periods of mains light in all."""
+
+MAX_EVENTS = 1 << 22
+"""What is remembered at most; a region that says more at rest has told enough."""
+
+RESTLESS_BIN_US = 1_000
+RESTLESS_SIGMAS = 5.0
+"""Excess of the ON-OFF difference's variance over independent signs that makes listening longer worth while."""
+
+HOT_SIGMAS = 5.0
+HOT_EVENTS = 3.0
+"""A pixel is hot where it fires this many standard deviations and events more often than its second busiest neighbour:
+an edge that trembles makes neighbours fire alike. By chance one in 10⁸ pixels does."""
+
+
+class Resting:
+    """Remembers the events of a region and its margin while nothing is meant to move.
+
+    Parameters
+    ----------
+    roi, geometry:
+        The region and the sensor.
+    """
+
+    def __init__(self, roi: Roi, geometry: Geometry) -> None:
+        self._geometry = geometry
+        self._inside = _box(roi, geometry, 0)
+        self.heard = _box(roi, geometry, ROI_MARGIN_PX)
+        """The region and its margin, as pixels of the sensor."""
+        self._pieces: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._count = 0
+        self._begin_us: int | None = None
+        self._end_us = 0
+        self.hot = np.zeros((geometry.height, geometry.width), np.bool_)
+        """Pixels not to believe, known after ``settle``."""
+        self.flicker: Flicker | None = None
+        """The lamp's flicker, known after ``settle``."""
+        self.residue = 0.0
+        """What its whole periods leave behind, in thresholds²."""
+        self.events = 0
+        """Events of the region that are not hot pixels'."""
+        self.noise_hz = 0.0
+        """The same per pixel and second."""
+
+    def add(
+        self,
+        t_us: NDArray[np.int64],
+        x: NDArray[np.uint16],
+        y: NDArray[np.uint16],
+        on: NDArray[np.uint8],
+        until_us: int | None,
+    ) -> None:
+        """Take events in time order, none before what was taken; *until_us* promises that no earlier will follow."""
+        inside = self.heard[y, x]
+        if self._begin_us is None:
+            if until_us is None and t_us.size == 0:
+                return
+            self._begin_us = int(t_us[0]) if t_us.size else int(until_us or 0)
+        if self._count < MAX_EVENTS:
+            self._end_us = max(self._end_us, int(until_us or 0), int(t_us[-1]) + 1 if t_us.size else 0)
+            pixel = y[inside].astype(np.int64) * self._geometry.width + x[inside]
+            self._pieces.append((t_us[inside].copy(), pixel, on[inside].copy()))
+            self._count += pixel.size
+
+    @property
+    def restless(self) -> bool:
+        """Whether ON and OFF events swing together more than independent ones would."""
+        t_us, _, on = self._events()
+        bins = self.duration_us // RESTLESS_BIN_US
+        if bins < 3 or t_us.size < bins:
+            return False
+        which = np.clip((t_us - (self._begin_us or 0)) // RESTLESS_BIN_US, 0, bins - 1)
+        sign = 2.0 * on - 1.0
+        mean = float(sign.mean())
+        count = np.bincount(which, minlength=bins)
+        swing = np.bincount(which, weights=sign, minlength=bins) - mean * count
+        ratio = float(np.square(swing).sum()) / (t_us.size * max(1.0 - mean**2, 1e-3))
+        return ratio > 1.0 + RESTLESS_SIGMAS * float(np.sqrt(2.0 / bins))
+
+    @property
+    def duration_us(self) -> int:
+        """How long was listened."""
+        return 0 if self._begin_us is None else max(0, self._end_us - self._begin_us)
+
+    def settle(self, weights: NDArray[np.int16]) -> RestingRate:
+        """Draw the conclusions; return what the region says at rest under *weights*, hot pixels left out."""
+        t_us, pixel, on = self._events()
+        begin_us = self._begin_us or 0
+        self.flicker = find_flicker(t_us, on, begin_us, self._end_us)
+        self.hot = self._hot(pixel, on)
+        kept = ~self.hot.ravel()[pixel]
+        t_us, pixel, on = t_us[kept], pixel[kept], on[kept]
+        counted = int(self._inside.ravel()[pixel].sum())
+        self.events = counted
+        duration_us = self.duration_us
+        self._pieces = []
+        if duration_us == 0:
+            return RestingRate()
+        self.noise_hz = 1e6 * counted / duration_us / max(1, int((self._inside & ~self.hot).sum()))
+        if self.flicker is not None:
+            self.residue = residue(t_us, pixel, on, self.flicker, self._end_us)
+            self.events, listened_us = self._net_of_periods(t_us, pixel, on, self.flicker.period_us)
+            return RestingRate(0.0, self.events / listened_us)
+        elp = -float((2.0 * on - 1.0) @ weights.ravel()[pixel])
+        return RestingRate(elp / duration_us, counted / duration_us)
+
+    def _events(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]:
+        if not self._pieces:
+            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.uint8)
+        t_us, pixel, on = (np.concatenate(column) for column in zip(*self._pieces, strict=True))
+        self._pieces = [(t_us, pixel, on)]
+        return t_us, pixel, on
+
+    def _net_of_periods(
+        self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], period_us: float
+    ) -> tuple[int, float]:
+        """Return how many net events whole periods leave in the region, and how long those lasted."""
+        width = self._geometry.width
+        periods = WholePeriods(self._inside, self._begin_us or 0)
+        periods.add(t_us, (pixel % width).astype(np.uint16), (pixel // width).astype(np.uint16), on)
+        whole = max(1, int(self.duration_us / period_us))
+        edges = (self._begin_us or 0) + np.rint(period_us * np.arange(whole + 1)).astype(np.int64)
+        net = sum(periods.close(int(edges[k]), int(edges[k + 1])).t_us.size for k in range(whole))
+        return net, whole * period_us
+
+    def _hot(self, pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Judge by counts; under a lamp, to which pixels answer as differently as their thresholds are, by the net."""
+        height, width = self._geometry.height, self._geometry.width
+        if self.flicker is None:
+            count = np.bincount(pixel, minlength=height * width)
+        else:
+            count = np.abs(np.rint(np.bincount(pixel, weights=2.0 * on - 1.0, minlength=height * width)))
+        return hot_pixels(count.reshape(height, width).astype(np.int64))
+
+
+def _box(roi: Roi, geometry: Geometry, margin: int) -> NDArray[np.bool_]:
+    box = np.zeros((geometry.height, geometry.width), np.bool_)
+    top, left = max(0, roi.y - margin), max(0, roi.x - margin)
+    box[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin] = True
+    return box
+
+
+def hot_pixels(count: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which pixels fired far more often than any two of their neighbours; *count* is (height, width)."""
+    height, width = count.shape
+    wide = np.pad(count, 1)
+    highest = np.zeros_like(count)
+    second = np.zeros_like(count)
+    for row in range(3):
+        for column in range(3):
+            if row == column == 1:
+                continue
+            one = wide[row : row + height, column : column + width]
+            second = np.maximum(second, np.minimum(highest, one))
+            highest = np.maximum(highest, one)
+    expected = second + float(count.mean())
+    return np.asarray(count - second > HOT_EVENTS + HOT_SIGMAS * np.sqrt(expected), np.bool_)
