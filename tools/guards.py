@@ -1,6 +1,6 @@
 """Meet each misfortune many times on the simulated rig and count what comes of it; above all: false FOCUSED.
 
-    python tools/guards.py [--only NAME,NAME] [--seeds 20] [--first 0] [--json FILE] [--list]
+    python tools/guards.py [--only "NAME;NAME"] [--seeds 20] [--first 0] [--json FILE] [--list]
 
 A seed is a scene, a place of focus, a set of sensor imperfections, and a side to start from (even: below, odd: above).
 ``right`` is FOCUSED with the glass at rest within one depth of focus of true focus (of the plane that the sweep met
@@ -99,7 +99,7 @@ GUARDS = {
 def main() -> int:
     """Run, print a table; exit 1 if a cycle claimed focus where there was none."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", help="names, separated by semicolons or commas before a name of the list")
+    parser.add_argument("--only", help="names, separated by semicolons")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--json", type=Path, help="write every cycle to this file, one object a line")

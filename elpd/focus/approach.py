@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from elpd.records import CommandStamp, LensReport
 
 APPROACH_MARGIN_UM = 1.0
-"""How much further than the backlash the final approach begins: what a model of the motor may be wrong by, and a step."""
+"""How much further than the backlash the final approach begins: a step, and what a model of the motor may err by."""
 
 BRAKING_SHARE = 0.25
 """Of the final approach's way: so close before the turn the lens brakes, and the next command needs the time left."""

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
-from elpd.vision.depths import find_depths
+from elpd.vision.depths import find_depths, shares_of_planes
 from elpd.vision.integral import (
     BANDS_PX,
     MISMATCH,
@@ -84,6 +84,10 @@ ROI_MARGIN_PX = 14
 
 PLANE_KERNEL = 0.1
 """Standard deviation, in widths, of the kernel that finds the mode of one plane's pairs among several planes."""
+
+PLANES_AGREE = 0.5
+"""How far from its pairs the sharpest place of a plane's own part of the picture may be, in shares of the least gap
+of planes: edges that move make clusters of pairs, but sharpen nothing."""
 
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
@@ -201,7 +205,7 @@ def ask_events(
     at_peak, _ = _rebuilt(events, groups, np.array([peak]))
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
     pairs, lag = _pair_mode(found, at_peak[0], peak, end, slowness)
-    planes = _planes(found, at_peak[0], begin, peak, lag.at * slowness)
+    planes = _planes(found, events, at_peak[0], (begin, peak, end), lag.at * slowness)
     if planes:
         return EventWitnesses(None, planes[0], lag, tuple(plane.at for plane in planes), _flank_width(begin, peak))
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
@@ -364,9 +368,18 @@ def _flank_width(begin: float, peak: float) -> float:
 
 
 def _planes(
-    pairs: Pairs, level: NDArray[np.float32], begin: float, peak: float, late: NDArray[np.float64]
+    pairs: Pairs,
+    events: EventStretch,
+    level: NDArray[np.float32],
+    stretch: tuple[float, float, float],
+    late: NDArray[np.float64],
 ) -> list[Mode]:
-    """Return where planes of the region are in focus, if there are several; *late* is each pixel's lag."""
+    """Return where planes of the region are in focus, if there are several.
+
+    *stretch* is where the curve's rising flank, its peak and the record's end lie, *late* each pixel's lag. The planes'
+    own parts of the picture must be sharpest where their pairs say.
+    """
+    begin, peak, end = stretch
     width = _flank_width(begin, peak)
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     middle = pairs.middle - late[pairs.y, pairs.x]
@@ -376,7 +389,17 @@ def _planes(
     clusters = find_depths(middle, weights, pairs.x[believed], pairs.y[believed], width)
     held = sum(float(weights[one].sum()) for one in clusters) / max(float(weights.sum()), 1e-300)
     modes = [weighted_mode(middle[one], weights[one], PLANE_KERNEL * width) for one in clusters]
-    return [replace(mode, share=held) for mode in modes if mode is not None]
+    known = [replace(mode, share=held) for mode in modes if mode is not None and mode.count >= _MIN_PAIRS]
+    if len(known) < 2 or len(known) < len(modes):
+        return []
+    shares = shares_of_planes(clusters, pairs.x[believed], pairs.y[believed], level.shape)
+    ticks = np.linspace(begin - width, end, TICKS)
+    tops = [float(ticks[int(np.argmax(_rebuilt_curve(events, ticks, peak, share)[0]))]) for share in shares]
+    places = np.array([mode.at for mode in known])
+    allowed = PLANES_AGREE * float(np.diff(places).min())
+    # Each part must be sharpest where its pairs say, and the parts as far apart as the pairs.
+    astray = np.concatenate([np.abs(tops - places), np.abs(np.diff(tops) - np.diff(places))])
+    return known if bool((astray <= allowed).all()) else []
 
 
 def without_lag(

@@ -2,7 +2,7 @@
 
 The sharpness of a region with two planes is one broad hill, whose top lies between them and shows neither. A pixel's
 mirror pair knows only its own plane, so the pairs' midpoints form one narrow cluster for each. Clusters count as depths
-if they are more than a depth of focus apart, if hardly any pair lies between them, and if they come from *different
+if they are more than two depths of focus apart, if hardly any pair lies between them, and if they come from *different
 places* of the region: an edge that moves to and fro makes clusters too, but at the same places.
 """
 
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 KERNEL = 0.04
 """Standard deviation of the smoothing, in widths of the curve of log S: a fifth of a depth of focus."""
 
-APART = 0.2
-"""Least distance of two depths in widths: one depth of focus. Planes closer than that are sharp together."""
+APART = 0.4
+"""Least distance of two depths in widths: two depths of focus. Closer ones cannot be told from slow photoreceptors in
+the dark parts of one."""
 
 VALLEY = 0.35
 """Density between two clusters over that at the lower one's top, at the most."""
@@ -110,3 +111,21 @@ def _purity(clusters: list[NDArray[np.bool_]], x: NDArray[np.uint16], y: NDArray
     held = np.array([np.bincount(block[one], minlength=int(block.max()) + 1) for one in clusters])
     held = held[:, held.sum(axis=0) >= LEAST_IN_BLOCK]
     return float(held.max(axis=0).sum() / held.sum()) if held.size else 0.0
+
+
+def shares_of_planes(
+    clusters: list[NDArray[np.bool_]], x: NDArray[np.uint16], y: NDArray[np.uint16], shape: tuple[int, ...]
+) -> list[NDArray[np.float32]]:
+    """Return, for each cluster, which pixels of an image (height, width) are in blocks where it prevails: 1 or 0."""
+    height, width = shape
+    rows, columns = -(-height // BLOCK_PX), -(-width // BLOCK_PX)
+    block = (y.astype(np.int64) // BLOCK_PX) * columns + x // BLOCK_PX
+    held = np.array([np.bincount(block[one], minlength=rows * columns) for one in clusters])
+    first = held.argmax(axis=0)
+    shares = []
+    for k in range(len(clusters)):
+        prevails = ((first == k) & (held[k] > 0)).reshape(rows, columns).astype(np.float32)
+        shares.append(
+            np.ascontiguousarray(np.kron(prevails, np.ones((BLOCK_PX, BLOCK_PX), np.float32))[:height, :width])
+        )
+    return shares

@@ -18,7 +18,7 @@ def joined(*planes: tuple) -> tuple[np.ndarray, ...]:
     return tuple(np.concatenate(column) for column in zip(*planes, strict=True))
 
 
-@pytest.mark.parametrize("apart", [10.0, 15.0, 60.0])
+@pytest.mark.parametrize("apart", [14.0, 20.0, 60.0])
 def test_two_planes_are_found_nearest_first(apart: float) -> None:
     middle, weights, x, y = joined(plane(0, apart, columns=(0, 48)), plane(1, 0.0, columns=(48, 96)))
     found = find_depths(middle, weights, x, y, WIDTH)
@@ -36,8 +36,8 @@ def test_one_plane_is_one_however_wide_its_pairs_scatter(spread: float) -> None:
         assert find_depths(*plane(seed, 0.0, spread=spread), WIDTH) == []
 
 
-def test_planes_within_a_depth_of_focus_are_one() -> None:
-    assert find_depths(*joined(plane(0, 0.0, 500, 0.4, (0, 48)), plane(1, 4.0, 500, 0.4, (48, 96))), WIDTH) == []
+def test_planes_within_two_depths_of_focus_are_one() -> None:
+    assert find_depths(*joined(plane(0, 0.0, 500, 0.4, (0, 48)), plane(1, 8.0, 500, 0.4, (48, 96))), WIDTH) == []
 
 
 def test_clusters_at_the_same_places_are_motion() -> None:
