@@ -43,10 +43,14 @@ _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (12
 
 @dataclass(frozen=True, slots=True)
 class FrameFile:
-    """A frame that lies on disk: usable from ``t_us`` on."""
+    """A frame that lies on disk: usable from ``t_us`` on.
+
+    ``middle_us`` is the middle of its exposure where that is known to be earlier.
+    """
 
     t_us: int
     path: Path
+    middle_us: int | None = None
 
     def load(self) -> NDArray[np.generic]:
         """Read the pixels. Raises ``FormatError``."""

@@ -29,9 +29,7 @@ from elpd.vision.reference import Reference, check_size, reference_from_frame
 from elpd.vision.track import FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from elpd.record.layouts import RecordedSweep
+    from elpd.record.layouts import FrameFile, RecordedSweep
     from elpd.records import ElpSample, Roi
     from elpd.vision.ruler import Ruler
 
@@ -127,7 +125,7 @@ class SweepSearch:
             found = self._events(done, max(done, until), frame.t_us if frame.t_us > self._begin_us else None)
             if found is None:
                 done = max(done, until)
-                found = self._frame(frame.t_us, frame.load())
+                found = self._frame(frame)
             if found is not None:
                 return found
         found = self._events(done, self._sweep.t_us.size, None)
@@ -158,7 +156,8 @@ class SweepSearch:
             closing = min(closing, complete_until_us)
         return replace(found, decided_us=closing)
 
-    def _frame(self, t_us: int, pixels: NDArray[np.generic]) -> Detection | None:
+    def _frame(self, frame: FrameFile) -> Detection | None:
+        t_us, pixels = frame.t_us, frame.load()
         check_size(pixels.shape, self._sweep.geometry, f"frame of {t_us} us")
         reference = reference_from_frame(pixels, self._roi)
         if self._reference is None and not reference.textured:
@@ -167,7 +166,8 @@ class SweepSearch:
         self._meter.set_reference(reference)
         if t_us < self._begin_us:
             return None
-        self._frames.add(t_us, self._ruler.position(t_us), self._frame_energy.measure(pixels))
+        middle_us = t_us if frame.middle_us is None else frame.middle_us
+        self._frames.add(t_us, self._ruler.position(middle_us), self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 
