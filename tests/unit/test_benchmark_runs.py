@@ -83,7 +83,7 @@ def test_dask_starts_workers_of_its_own_and_ends_them(tmp_path: Path) -> None:
     """Processes, which have to find this code: real methods on a real case, small."""
     pytest.importorskip("distributed")
     arguments = ["--out", str(tmp_path / "out"), "--sets", "nothing", "--cases", "nothing-cap-fov1-static"]
-    arguments += ["--methods", "egs,pbf", "--cache", "none"]
+    arguments += ["--methods", "egs,pbf", "--cache", str(tmp_path / "cases")]
     assert benchmark.main([*arguments, "--executor", "dask", "--jobs", "1"]) == 0
     there = (tmp_path / "out" / "rows.csv").read_bytes()
     arguments[1] = str(tmp_path / "here")
