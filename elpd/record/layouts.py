@@ -43,14 +43,10 @@ _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (12
 
 @dataclass(frozen=True, slots=True)
 class FrameFile:
-    """A frame that lies on disk: usable from ``t_us`` on.
-
-    ``middle_us`` is the middle of its exposure where that is known to be earlier.
-    """
+    """A frame that lies on disk: usable from ``t_us`` on."""
 
     t_us: int
     path: Path
-    middle_us: int | None = None
 
     def load(self) -> NDArray[np.generic]:
         """Read the pixels. Raises ``FormatError``."""
@@ -62,7 +58,8 @@ class RecordedSweep:
     """A sweep on disk: events in time order, frames, and the region its makers chose.
 
     ``t_us`` ``int64``, ``x`` and ``y`` ``uint16``, ``on`` ``uint8`` (1 brighter, 0 darker), all of one length.
-    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it.
+    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it. ``frame_age_us`` is how
+    long before a frame was there the middle of its exposure lay, where frames are stamped with when they were there.
     """
 
     t_us: NDArray[np.int64]
@@ -74,6 +71,7 @@ class RecordedSweep:
     frames: tuple[FrameFile, ...] = ()
     bin_us: int | None = None
     warnings: tuple[str, ...] = field(default=())
+    frame_age_us: int = 0
 
 
 def read_sweep(path: Path, *, frames: str | None = None, size: Geometry | None = None) -> RecordedSweep:

@@ -29,7 +29,9 @@ from elpd.vision.reference import Reference, check_size, reference_from_frame
 from elpd.vision.track import FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
-    from elpd.record.layouts import FrameFile, RecordedSweep
+    from numpy.typing import NDArray
+
+    from elpd.record.layouts import RecordedSweep
     from elpd.records import ElpSample, Roi
     from elpd.vision.ruler import Ruler
 
@@ -125,7 +127,7 @@ class SweepSearch:
             found = self._events(done, max(done, until), frame.t_us if frame.t_us > self._begin_us else None)
             if found is None:
                 done = max(done, until)
-                found = self._frame(frame)
+                found = self._frame(frame.t_us, frame.load())
             if found is not None:
                 return found
         found = self._events(done, self._sweep.t_us.size, None)
@@ -156,8 +158,7 @@ class SweepSearch:
             closing = min(closing, complete_until_us)
         return replace(found, decided_us=closing)
 
-    def _frame(self, frame: FrameFile) -> Detection | None:
-        t_us, pixels = frame.t_us, frame.load()
+    def _frame(self, t_us: int, pixels: NDArray[np.generic]) -> Detection | None:
         check_size(pixels.shape, self._sweep.geometry, f"frame of {t_us} us")
         reference = reference_from_frame(pixels, self._roi)
         if self._reference is None and not reference.textured:
@@ -166,8 +167,8 @@ class SweepSearch:
         self._meter.set_reference(reference)
         if t_us < self._begin_us:
             return None
-        middle_us = t_us if frame.middle_us is None else frame.middle_us
-        self._frames.add(t_us, self._ruler.position(middle_us), self._frame_energy.measure(pixels))
+        exposed = self._ruler.position(t_us - self._sweep.frame_age_us)
+        self._frames.add(t_us, exposed, self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 

@@ -261,7 +261,7 @@ def test_the_benchmark_runs_resumes_and_writes_one_self_contained_report(
 ) -> None:
     out = tmp_path / "results"
     common = ["--out", str(out), "--cache", str(cache), "--seed", "3", "--executor", "serial"]
-    common += ["--cases", "*-camera-fov1-violent", "--rates", "50"]
+    common += ["--quick", "--sets", "syn", "--cases", "*-violent", "--rates", "50"]
     assert benchmark.main([*common, "--methods", "egs,pbf,elp-syn"]) == 0
     first = json.loads((out / "results.json").read_text())
     assert [one["method"] for one in first["rows"]] == ["egs", "pbf", "elp-syn"]
@@ -290,6 +290,20 @@ def test_the_benchmark_runs_resumes_and_writes_one_self_contained_report(
     assert page.count("<svg") >= 3
     assert "2.26" in page  # the paper's number stands beside ours
     assert not re.search(r"(src|href)=", page)
+
+
+@pytest.mark.parametrize("executor", ["joblib", "dask"])
+def test_processes_give_what_one_process_gives(executor: str, cache: Path, tmp_path: Path) -> None:
+    """Real methods on a real case; a cluster of its own is started, with processes that have to find this code."""
+    pytest.importorskip({"joblib": "joblib", "dask": "distributed"}[executor])
+    common = ["--cache", str(cache), "--seed", "3", "--sets", "syn", "--cases", "*-camera-fov1-violent"]
+    common += ["--methods", "egs,pbf,elp-syn"]
+    rows = []
+    for one, jobs in (("serial", "1"), (executor, "2" if executor == "joblib" else "1")):
+        out = tmp_path / one
+        assert benchmark.main(["--out", str(out), "--executor", one, "--jobs", jobs, *common]) == 0
+        rows.append((out / "rows.csv").read_bytes())
+    assert rows[0] == rows[1]
 
 
 def test_every_method_has_a_title_and_a_rate() -> None:

@@ -79,18 +79,6 @@ def test_every_executor_gives_the_same_rows_to_the_byte(tmp_path: Path, monkeypa
     assert found["dask"] == found["serial"]
 
 
-def test_dask_starts_workers_of_its_own_and_ends_them(tmp_path: Path) -> None:
-    """Processes, which have to find this code: real methods on a real case, small."""
-    pytest.importorskip("distributed")
-    arguments = ["--out", str(tmp_path / "out"), "--sets", "nothing", "--cases", "nothing-cap-fov1-static"]
-    arguments += ["--methods", "egs,pbf", "--cache", str(tmp_path / "cases")]
-    assert benchmark.main([*arguments, "--executor", "dask", "--jobs", "1"]) == 0
-    there = (tmp_path / "out" / "rows.csv").read_bytes()
-    arguments[1] = str(tmp_path / "here")
-    assert benchmark.main([*arguments, "--executor", "serial"]) == 0
-    assert (tmp_path / "here" / "rows.csv").read_bytes() == there
-
-
 def test_workers_of_another_edition_and_schedulers_that_do_not_answer_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

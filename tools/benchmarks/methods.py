@@ -153,7 +153,6 @@ class _HeldFrame:
 
     t_us: int
     pixels: NDArray[np.uint8]
-    middle_us: int
 
     def load(self) -> NDArray[np.uint8]:
         return self.pixels
@@ -213,7 +212,7 @@ def _run_ours(
     reference: Reference | None,
 ) -> Row:
     age_us = recording.case.of_set.frame_age_us
-    held = tuple(_HeldFrame(frame.t_us + age_us, frame.pixels, frame.t_us) for frame in frames)
+    held = tuple(_HeldFrame(frame.t_us + age_us, frame.pixels) for frame in frames)
     sweep = RecordedSweep(
         recording.t_us,
         recording.x,
@@ -221,7 +220,8 @@ def _run_ours(
         recording.on,
         recording.geometry,
         recording.roi,
-        held,  # type: ignore[arg-type]  # same shape as FrameFile: t_us, middle_us and load()
+        held,  # type: ignore[arg-type]  # same shape as FrameFile: t_us and load()
+        frame_age_us=age_us,
     )
     started = time.process_time()
     chosen = recording.case.of_set
