@@ -1,7 +1,8 @@
 """What the controller is to show, what was measured, and whether the one meets the other.
 
-Every verdict is computed from rows. ``met`` needs every sweep that the goal is about; on some of them a goal can be
-broken but not met, so it is met *so far*. What nobody measured says so. Rows of the benchmark are the detector's on
+Every verdict is computed from rows. ``met`` and ``not met`` need every sweep that the goal is about. On some of them a
+mean holds or does not hold *so far*, while one answer that must never be given is enough to break a goal. What nobody
+measured says so. Rows of the benchmark are the detector's on
 recorded sweeps: an estimate, causal, without a lens to stop. What a lens did comes from ``tools/acceptance.py`` and
 stands beside it under the run's name.
 """
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
     from benchmarks.live import LiveRun
     from benchmarks.methods import Row
 
-MET, NOT_MET, SO_FAR, UNMEASURED = "met", "not met", "met so far", "not measured"
+MET, NOT_MET, UNMEASURED = "met", "not met", "not measured"
+SO_FAR = " so far"
 OFFLINE = "recorded sweeps"
 BESIDE = ("egs", "pbf", "esva", "elp-syn", "elp-syn-1fps", "elp-davis", "elp-evk4")
 """The peers whose means on the same sweeps stand beside ours."""
@@ -116,20 +118,29 @@ def verdicts(rows: Sequence[Row], live: Sequence[LiveRun] = ()) -> list[Verdict]
     return table
 
 
-def state(*, broken: bool, trials: int, wanted: int) -> str:
-    """Return the verdict in words."""
+def state(*, over: bool, trials: int, wanted: int, broken: bool = False) -> str:
+    """Return the verdict in words.
+
+    *over* says that a mean or a share is over its limit, which more trials may change; *broken* what none can mend.
+    """
     if trials == 0:
         return UNMEASURED
     if broken:
         return NOT_MET
-    return MET if trials >= wanted else SO_FAR
+    return (NOT_MET if over else MET) + ("" if trials >= wanted else SO_FAR)
+
+
+def direction_state(wrong: int, allowed: int, trials: int) -> str:
+    """Return the verdict on directions: so many wrong of so many, in proportion where there are more than 200."""
+    over = wrong > allowed * max(1.0, trials / TRIALS)
+    return state(over=over, broken=over and allowed == 0, trials=trials, wanted=TRIALS)
 
 
 def tell(table: Sequence[Verdict]) -> list[str]:
     """Return the table as lines of text."""
     lines = []
     for one in table:
-        parts = [f"{one.verdict:12s} {one.goal}"]
+        parts = [f"{one.verdict:14s} {one.goal}"]
         if one.trials:
             parts.append(f"{one.source}, {one.trials} of {one.wanted}: {measured(one)}")
         lines.append("  ".join(parts))
@@ -168,8 +179,9 @@ def _accuracy(goal: Accuracy, found: Sequence[Row], rows: Sequence[Row]) -> Verd
     if goal.motion == "shake":
         words += f", early below {EARLY_SHARE:.0%}"
     mae_um = float(errors.mean()) if errors.size else None
-    broken = mae_um is None or mae_um > goal.mae_um or outside > 0 or (every and missed > 0)
-    broken = broken or (goal.motion == "shake" and early >= EARLY_SHARE * len(found))
+    over = mae_um is None or mae_um > goal.mae_um
+    over = over or (goal.motion == "shake" and early >= EARLY_SHARE * len(found))
+    broken = outside > 0 or (every and missed > 0)
     wanted = len(cases_of(goal.set_name, 0, f"*-{goal.motion}")) * _seeds(rows)
     return Verdict(
         words,
@@ -183,7 +195,7 @@ def _accuracy(goal: Accuracy, found: Sequence[Row], rows: Sequence[Row]) -> Verd
         outside=outside,
         early=early,
         beside=_beside(goal, rows),
-        verdict=state(broken=broken, trials=len(found), wanted=wanted),
+        verdict=state(over=over, broken=broken, trials=len(found), wanted=wanted),
     )
 
 
@@ -231,7 +243,7 @@ def _abstentions(words: str, by_goal: dict[Accuracy, list[Row]], limit: float) -
         wanted,
         missed=missed,
         abstained_share=share,
-        verdict=state(broken=share is not None and share >= limit, trials=len(found), wanted=wanted),
+        verdict=state(over=share is not None and share >= limit, trials=len(found), wanted=wanted),
     )
 
 
@@ -257,7 +269,7 @@ def _nothing(rows: Sequence[Row]) -> Verdict:
         TRIALS,
         outside=len(false),
         other=f"{len(false)} false in {len(found)} runs on {sweeps} sweeps",
-        verdict=state(broken=bool(false), trials=sweeps, wanted=TRIALS),
+        verdict=state(over=False, broken=bool(false), trials=sweeps, wanted=TRIALS),
     )
 
 
@@ -282,6 +294,5 @@ def _direction(rows: Sequence[Row], motion: str, allowed: int, beside: str = "")
         TRIALS,
         other=f"{wrong} wrong, {unknown} never decided, of {sweeps} sweeps that approach",
         beside=beside,
-        # In proportion where there are more than that many.
-        verdict=state(broken=wrong > allowed * max(1.0, sweeps / TRIALS), trials=sweeps, wanted=TRIALS),
+        verdict=direction_state(wrong, allowed, sweeps),
     )

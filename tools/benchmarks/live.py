@@ -21,6 +21,7 @@ from benchmarks.goals import (
     TRIALS,
     Accuracy,
     Verdict,
+    direction_state,
     state,
 )
 from benchmarks.sets import SETS
@@ -66,8 +67,8 @@ class LiveRun:
         early = sum(bool(row.get("stopped_early")) for row in self.rows)
         shaken = goal.motion == "shake"
         mae_um = float(errors.mean()) if errors.size else None
-        broken = mae_um is None or mae_um > goal.mae_um or outside > 0
-        broken = broken or (shaken and early >= EARLY_SHARE * len(self.rows))
+        over = mae_um is None or mae_um > goal.mae_um
+        over = over or (shaken and early >= EARLY_SHARE * len(self.rows))
         return Verdict(
             f"{goal.set_name} {goal.motion}, at rest: MAE at most {goal.mae_um:g} um, none FOCUSED outside "
             f"{limit_um:g} um",
@@ -82,7 +83,7 @@ class LiveRun:
             early=early,
             other=f"from {sorted({row['start_um'] for row in self.rows})} um",
             beside=goal.claim,
-            verdict=state(broken=broken, trials=len(self.rows), wanted=self.wanted),
+            verdict=state(over=over, broken=outside > 0, trials=len(self.rows), wanted=self.wanted),
         )
 
     def others(self) -> list[Verdict]:
@@ -115,7 +116,7 @@ class LiveRun:
             self.wanted,
             missed=missed,
             abstained_share=share,
-            verdict=state(broken=share >= limit, trials=len(self.rows), wanted=self.wanted),
+            verdict=state(over=share >= limit, trials=len(self.rows), wanted=self.wanted),
         )
 
     def _direction(self, allowed: int) -> Verdict:
@@ -127,7 +128,7 @@ class LiveRun:
             len(judged),
             TRIALS,
             other=f"{wrong} wrong of {len(judged)} cycles",
-            verdict=state(broken=wrong > allowed * max(1.0, len(judged) / TRIALS), trials=len(judged), wanted=TRIALS),
+            verdict=direction_state(wrong, allowed, len(judged)),
         )
 
     def _time(self) -> Verdict:
@@ -151,7 +152,7 @@ class LiveRun:
             other="; ".join(told),
             beside="paper: ELP 103 to 113 ms without its stopping error, EGS and PBF 302 to 404 ms",
             verdict=state(
-                broken=median_ms is not None and median_ms > ONE_WAY_MS, trials=len(straight), wanted=self.wanted
+                over=median_ms is not None and median_ms > ONE_WAY_MS, trials=len(straight), wanted=self.wanted
             ),
         )
 

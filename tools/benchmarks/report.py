@@ -10,7 +10,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.calibration import BEYOND_TWO_SIGMA, draw_calibration
-from benchmarks.goals import MET, UNMEASURED, measured, rate_name
+from benchmarks.goals import MET, NOT_MET, UNMEASURED, measured, rate_name
 from benchmarks.methods import OURS, all_methods
 from benchmarks.plots import Plot, Series, draw
 from benchmarks.sets import MAP, REBUILT, SETS
@@ -146,7 +146,7 @@ def _goals(goals: Sequence[Verdict]) -> str:
     names = "".join(f"<th class='word'>{head}</th>" for head in heads)
     lines = [f"<h2>Goals</h2><p>{told}</p><div class='scroll'><table><tr>{names}</tr>"]
     for one in goals:
-        kind = "word" if one.verdict in (MET, UNMEASURED) else "word so" if one.verdict.startswith(MET) else "word bad"
+        kind = "word" if one.verdict in (MET, UNMEASURED) else "word bad" if one.verdict == NOT_MET else "word so"
         words = (one.goal, one.source, f"{one.trials} of {one.wanted}", measured(one) if one.trials else "–")
         cells = "".join(f"<td class='word'>{escape(word)}</td>" for word in words)
         beside = f"<td class='word long'>{escape(one.beside)}</td>"
