@@ -22,6 +22,7 @@ import csv
 import json
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -189,9 +190,11 @@ def _run(works: Sequence[Work], chosen: argparse.Namespace) -> list[Row]:
     found: dict[Path, list[Row]] = {}
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task("cases", total=len(works))
-        for work, rows in run_all(works, chosen.executor, chosen.jobs, chosen.scheduler):
-            found[work.path] = rows
-            progress.advance(task)
+        # Closed at once when interrupted, so that workers are ended here and not whenever memory is cleaned up.
+        with closing(run_all(works, chosen.executor, chosen.jobs, chosen.scheduler)) as answers:
+            for work, rows in answers:
+                found[work.path] = rows
+                progress.advance(task)
     # In the order of cases, whoever was faster; a case's rows come in the order of methods and their rates.
     return [row for work in works for row in found[work.path]]
 

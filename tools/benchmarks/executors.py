@@ -7,6 +7,7 @@ disk with the process that keeps the results.
 
 from __future__ import annotations
 
+import warnings
 from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from benchmarks.cases import GENERATION
 from elpd.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterator, Sequence
 
     Run = Callable[[Any], Any]
 
@@ -30,7 +31,7 @@ CONNECT_S = 20
 
 def spread(
     run: Run, tasks: Sequence[Any], executor: str, jobs: int, scheduler: str | None = None
-) -> Iterator[tuple[int, Any]]:
+) -> Generator[tuple[int, Any]]:
     """Yield the number and the answer of every task, in no particular order.
 
     *scheduler* is the address of a dask scheduler; without one, ``dask`` starts *jobs* workers on this machine.
@@ -54,7 +55,15 @@ def _joblib(run: Run, tasks: Sequence[Any], jobs: int) -> Iterator[tuple[int, An
     except ImportError:
         raise UsageError("joblib is not installed; pip install 'elpd[test]', or --executor serial") from None
     calls = (delayed(_numbered)(run, one) for one in enumerate(tasks))
-    yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+    answers = Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+    try:
+        for answer in answers:  # noqa: UP028  (`yield from` would close it outside the filter below)
+            yield answer
+    finally:
+        with warnings.catch_warnings():
+            # Who interrupts a run knows that it was not finished.
+            warnings.simplefilter("ignore", UserWarning)
+            answers.close()
 
 
 def _dask(run: Run, tasks: Sequence[Any], jobs: int, scheduler: str | None) -> Iterator[tuple[int, Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ from benchmarks.recorded import read_recorded
 from benchmarks.sets import E2VID, MAP, REBUILT, SETS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Sequence
     from pathlib import Path
 
     from benchmarks.cases import Case
@@ -87,7 +88,7 @@ def run_task(task: Task) -> list[Row]:
 
 def run_all(
     works: Sequence[Work], executor: str, jobs: int, scheduler: str | None = None
-) -> Iterator[tuple[Work, list[Row]]]:
+) -> Generator[tuple[Work, list[Row]]]:
     """Yield each case's rows as they come, in no particular order; each is kept before it is yielded."""
     open_works, tasks = [], []
     for work in works:
@@ -100,11 +101,12 @@ def run_all(
             yield work, [known[pair] for pair in work.task.wanted]
     if not tasks:
         return
-    for number, rows in spread(run_task, tasks, executor, jobs, scheduler):
-        work, known = open_works[number]
-        known |= {(row.method, row.rate): row for row in rows}
-        _keep(work, list(known.values()))
-        yield work, [known[pair] for pair in work.task.wanted]
+    with closing(spread(run_task, tasks, executor, jobs, scheduler)) as answers:
+        for number, rows in answers:
+            work, known = open_works[number]
+            known |= {(row.method, row.rate): row for row in rows}
+            _keep(work, list(known.values()))
+            yield work, [known[pair] for pair in work.task.wanted]
 
 
 def _keep(work: Work, rows: Sequence[Row]) -> None:
