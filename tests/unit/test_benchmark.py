@@ -242,6 +242,8 @@ def test_misses_and_wild_answers_are_counted_beside_the_mean_not_in_it() -> None
     assert score.worst_um == 20.0
     assert score.published_um == 4.93
     assert (score.limit_um, score.spread, score.beyond_two) == (0.5, pytest.approx(5.916, abs=1e-3), 0.3333)
+    (on_a_rig,) = scores([replace(row(2.0), set_name="davis-bright")])
+    assert (on_a_rig.published_um, on_a_rig.published_cpu_ms, on_a_rig.published_focusing_ms) == (10.9, 2.37, 302.4)
     (nothing,) = scores([row(None)])
     assert nothing.mae_um is None
     (fooled,) = scores([replace(row(0.5), set_name="nothing"), replace(row(None), set_name="nothing")])

@@ -66,7 +66,12 @@ def scheduler_for(executor: str) -> Iterator[list[str]]:
         return
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp://"
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address="127.0.0.1:0",
+        host="127.0.0.1",
+        protocol="tcp://",
     ) as cluster:
         yield ["--scheduler", cluster.scheduler_address]
 
@@ -93,7 +98,7 @@ def test_workers_of_another_edition_and_schedulers_that_do_not_answer_are_refuse
     assert "no dask scheduler at tcp://127.0.0.1:9" in capsys.readouterr().err
     monkeypatch.setattr("benchmarks.executors.CONNECT_S", 20)
     with distributed.LocalCluster(
-        n_workers=0, processes=False, dashboard_address=None, host="127.0.0.1", protocol="tcp://"
+        n_workers=0, processes=False, dashboard_address="127.0.0.1:0", host="127.0.0.1", protocol="tcp://"
     ) as cluster:
         common += ["--scheduler", cluster.scheduler_address]
         assert benchmark.main(common) == 2

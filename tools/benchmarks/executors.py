@@ -73,8 +73,10 @@ def _dask(run: Run, tasks: Sequence[Any], jobs: int, scheduler: str | None) -> I
         raise UsageError("dask.distributed is not installed; pip install 'elpd[cluster]'") from None
     with ExitStack() as opened:
         if scheduler is None:
-            # One thread each: kernels hold no lock, but OpenCV and FFTs share caches badly. No dashboard: no open port.
-            cluster = LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+            # One thread each: OpenCV and FFTs share a processor badly. Any free port for the page: 8787 may be taken.
+            cluster = LocalCluster(
+                n_workers=jobs, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+            )
             client = opened.enter_context(Client(opened.enter_context(cluster)))
         else:
             try:

@@ -211,7 +211,7 @@ def _beside(goal: Accuracy, rows: Sequence[Row]) -> str:
     told = [goal.claim] if goal.claim else []
     if goal.set_name == "syn":
         for name, rate in SYN_MAE_UM:
-            published = published_mae_um(name, rate, goal.motion)
+            published = published_mae_um("syn", name, rate, goal.motion)
             if rate in (NO_FRAMES, goal.rate) and published is not None:
                 told.append(f"paper: {name} {published:.2f}")
         rerun = rerun_mae_um("esva", NO_FRAMES, goal.motion)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.published import published_mae_um, rerun_mae_um
+from benchmarks.published import published_mae_um, published_times_ms, rerun_mae_um
 from benchmarks.sets import SETS
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ class Score:
     beyond_two: float | None
     limit_um: float | None
     published_um: float | None
+    published_focusing_ms: float | None
+    published_cpu_ms: float | None
     rerun_um: float | None
 
     def as_dict(self) -> dict[str, Any]:
@@ -97,6 +99,8 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
         spread=round(float(np.sqrt(np.mean(claimed**2))), 3) if claimed.size else None,
         beyond_two=round(float((np.abs(claimed) > 2.0).mean()), 4) if claimed.size else None,
         limit_um=round(float(np.median(limits)), 3) if limits.size else None,
-        published_um=published_mae_um(method, rate, motion) if set_name == "syn" else None,
+        published_um=published_mae_um(set_name, method, rate, motion),
+        published_focusing_ms=published_times_ms(set_name, method)[1],
+        published_cpu_ms=published_times_ms(set_name, method)[0],
         rerun_um=rerun_mae_um(method, rate, motion) if set_name == "syn" else None,
     )
