@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from elpd_drivers.lenses import grbl as grbl_driver
-from elpd_drivers.lenses import tic as tic_driver
-from elpd_drivers.sim.boards.grbl import GrblBoard, GrblConfig
+import pytest
+from elpd_drivers.lenses import avr_wire
+from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
-from elpd_drivers.sim.boards.tic import TicBoard, TicConfig
+from elpd_drivers.sim.controllers import CONTROLLERS
 from elpd_drivers.sim.lens import SimulatedLens
 from virtual import MonotonicClock, TestClock
 
@@ -19,9 +19,95 @@ from elpd.units import HostNs
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-KINDS = ("tic", "grbl")
+KINDS = tuple(CONTROLLERS)
 UM_PER_STEP = 0.3125
 SPEED_SPS = 12_800.0  # 4 mm/s
+
+
+def _avr_lie(data: bytes) -> bytes:
+    """Put the position at the start (3200, no byte of it escaped) elsewhere, under a right CRC."""
+    if (3200).to_bytes(4, "little") not in data:
+        return data
+    body = bytearray()
+    escaped = False
+    for byte in data[1:-1]:
+        if byte == 0xFD:
+            escaped = True
+            continue
+        body.append(byte ^ 0x20 if escaped else byte)
+        escaped = False
+    sequence, command = body[0], body[1]
+    return avr_wire.encode(sequence, command, bytes(body[2:5]) + (900).to_bytes(4, "little") + bytes(body[9:-2]))
+
+
+def _tmcl_lie(data: bytes) -> bytes:
+    if data[4:8] != (3200).to_bytes(4, "big"):
+        return data
+    lie = data[:4] + (900).to_bytes(4, "big")
+    return lie + bytes((sum(lie) % 256,))
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What the contract must know of a protocol.
+
+    ``hardest_stop_ms`` is the time from the strongest stop at full speed to rest; ``moves`` tells the command that
+    starts a motion, ``lie`` makes the position at the start another one, in a reply that is right otherwise,
+    ``question`` is something that an earlier session may have asked, and ``spoil`` flips a bit that a checksum guards.
+    """
+
+    hardest_stop_ms: float
+    abrupt_keeps_reference: bool
+    moves: Callable[[bytes], bool]
+    lie: Callable[[bytes], bytes]
+    question: bytes
+    spoil: Callable[[bytes], bytes] | None
+    settings: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+def _flip(data: bytes) -> bytes:
+    return bytes((data[0], data[1] ^ 4, *data[2:]))
+
+
+RAMP_MS = 1000 * SPEED_SPS / 640_000.0
+DIALECTS = {
+    "tic": Dialect(
+        2.0,
+        abrupt_keeps_reference=True,
+        moves=lambda data: b"\xe0" in data,
+        lie=lambda data: (b"\0\0\7\0" + data[4:]) if len(data) == 8 else data,
+        question=bytes((0xA1, 0x22, 10)),
+        spoil=_flip,
+        settings={"crc_responses": True},
+        config={"crc_responses": True},
+    ),
+    "grbl": Dialect(
+        2.0,
+        abrupt_keeps_reference=False,
+        moves=lambda data: data.startswith(b"$J"),
+        lie=lambda data: data.replace(b"MPos:-1.500", b"MPos:-0.200"),
+        question=b"?",
+        spoil=None,
+        settings={"trust_position": True},
+    ),
+    "avr": Dialect(
+        2.0,
+        abrupt_keeps_reference=True,
+        moves=lambda data: data[:1] == b"\xfe" and data[2] == avr_wire.GO,
+        lie=_avr_lie,
+        question=avr_wire.encode(9, avr_wire.STATUS),
+        spoil=lambda data: bytes((*data[:7], data[7] ^ 4, *data[8:])),
+    ),
+    "tmcl": Dialect(
+        RAMP_MS + 6.0,
+        abrupt_keeps_reference=True,
+        moves=lambda data: data[1] == 4,
+        lie=_tmcl_lie,
+        question=bytes((1, 6, 1, 0, 0, 0, 0, 0, 8)),
+        spoil=lambda data: bytes((*data[:6], data[6] ^ 4, *data[7:])),
+    ),
+}
 
 
 @dataclass
@@ -35,10 +121,10 @@ class Rig:
     reports: list[Any] = field(default_factory=list)
 
     def open(self, **settings: Any) -> Any:
-        driver = tic_driver if self.kind == "tic" else grbl_driver
         if self.kind == "grbl":
             settings = {"trust_position": True, **settings}
-        self.lens = driver.open_lens(settings, self.clock, self.port)
+        self.lens = CONTROLLERS[self.kind].open_lens(settings, self.clock, self.port)
+        self.reports.clear()
         return self.lens
 
     def poll(self) -> None:
@@ -48,6 +134,12 @@ class Rig:
 
     def live(self, ms: float, each: Callable[[], object] | None = None) -> None:
         self.clock.pass_ms(ms, each or self.poll)
+
+    def plug_in(self) -> None:
+        """Connect the board, which had power all the time, by another cable."""
+        self.clock.actors.remove(self.port)
+        self.port = MemoryPort(self.board, self.clock)
+        self.clock.actors.append(self.port)
 
     def live_until(self, condition: Callable[[], bool], limit_ms: float = 3000.0) -> None:
         for _ in range(round(limit_ms)):
@@ -64,6 +156,10 @@ class Rig:
         return self.motor.rotor_at(self.clock.now_ns())
 
     @property
+    def dialect(self) -> Dialect:
+        return DIALECTS[self.kind]
+
+    @property
     def moving(self) -> bool:
         return self.motor.velocity_at(self.clock.now_ns()) != 0.0
 
@@ -71,12 +167,19 @@ class Rig:
         return self.motor.motor_steps(np.array(times_ns, dtype=np.int64))
 
 
+def _skip_what_cannot_be_built(kind: str) -> None:
+    hindrance = avr_board.hindrance() if kind == "avr" else None
+    if hindrance is not None:
+        pytest.skip(hindrance)
+
+
 def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool = True, **config: Any) -> Rig:
     """Make a rig in virtual time; ``open`` connects the driver."""
+    _skip_what_cannot_be_built(kind)
     clock = TestClock()
     motor = SimulatedLens(start_um=start_um)
-    make, settings = (TicBoard, TicConfig) if kind == "tic" else (GrblBoard, GrblConfig)
-    board = make(motor, settings(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
+    kinds = CONTROLLERS[kind].board
+    board = kinds.make(motor, kinds.config(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
     port = MemoryPort(board, clock)
     clock.actors.append(port)
     return Rig(kind, clock, motor, board, port)
@@ -91,6 +194,8 @@ def open_rig(kind: str, **kwargs: Any) -> Rig:
 
 def served(kind: str, clock: MonotonicClock, **config: Any) -> tuple[PtyServer, SimulatedLens]:
     """Serve a board on a pty."""
+    _skip_what_cannot_be_built(kind)
     motor = SimulatedLens(start_um=1000.0)
-    make, settings = (TicBoard, TicConfig) if kind == "tic" else (GrblBoard, GrblConfig)
-    return PtyServer(make(motor, settings(referenced=True, **config), begin_ns=clock.now_ns())), motor
+    kinds = CONTROLLERS[kind].board
+    config = kinds.config(referenced=True, **config)
+    return PtyServer(kinds.make(motor, config, seed=0, begin_ns=clock.now_ns())), motor

@@ -34,7 +34,7 @@ class Stage:
 
     def __init__(self, parts: RigParts) -> None:
         self.parts = parts
-        self.um_per_step = parts.um_per_step
+        self.scale = parts.scale
         latency_us = parts.camera.min_latency_us if isinstance(parts.camera, Latency) else 0.0
         self.sensor_clock = SensorClock(latency_us)
         self.frame: Frame | None = None
@@ -55,11 +55,16 @@ class Stage:
 
     def to_um(self, steps: float) -> float:
         """Convert steps to um on the motor's ruler."""
-        return steps * self.um_per_step
+        return self.scale.to_um(steps)
 
     def to_steps(self, um: float) -> Steps:
         """Convert um on the motor's ruler to the nearest step."""
-        return Steps(round(um / self.um_per_step))
+        return self.scale.to_steps(um)
+
+    @property
+    def um_per_step(self) -> float:
+        """How long a step is where the motor is now."""
+        return self.scale.um_per_step_at(self.here_um()) if self.scale.table else self.scale.um_per_step
 
     def position_um(self, when: SensorUs) -> float:
         """Return where the motor was at a sensor time."""
@@ -130,14 +135,25 @@ class Stage:
         while self.now_ns() < until:
             self.read(min(READ_TIMEOUT_S, (until - self.now_ns()) / 1e9))
 
-    def move(self, target_um: float, speed_um_s: float, acceleration_sps2: float) -> LensReport:
+    def within_limits_um(self, um: float) -> float:
+        """Return the place nearest to *um* that the lens may go to."""
+        limits = self.parts.lens.limits
+        return min(max(um, self.to_um(limits.min_steps)), self.to_um(limits.max_steps))
+
+    def send(self, target_um: float, speed_um_s: float) -> None:
+        """Let the lens set out to a place."""
+        self.parts.lens.move_to(self.to_steps(target_um), speed_um_s / self.um_per_step)
+
+    def travel_limit_ms(self, target_um: float, speed_um_s: float) -> float:
+        """Return how long the way from here to a place may take: three times what it should, ramps allowed for."""
+        ramps_s = 2 * speed_um_s / max(self.to_um(self.parts.lens.limits.acceleration_sps2), 1.0)
+        return 300.0 + 3000.0 * (abs(target_um - self.here_um()) / speed_um_s + ramps_s)
+
+    def move(self, target_um: float, speed_um_s: float) -> LensReport:
         """Go to a place and wait until at rest there. The wait is bounded by the way and the speed."""
-        steps = self.to_steps(target_um)
-        speed_sps = speed_um_s / self.um_per_step
-        start = self.parts.lens.position_at(self.now_ns()).steps
-        self.parts.lens.move_to(steps, speed_sps)
-        way_s = abs(steps - start) / speed_sps + 2 * speed_sps / max(acceleration_sps2, 1.0)
-        return self.rest(300.0 + 3000.0 * way_s, steps)
+        limit_ms = self.travel_limit_ms(target_um, speed_um_s)
+        self.send(target_um, speed_um_s)
+        return self.rest(limit_ms, self.to_steps(target_um))
 
     def hear(self, limit_ms: float) -> None:
         """Read until the camera has spoken of the time after now: what follows may be judged by its silence.

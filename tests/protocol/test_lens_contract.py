@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
-from elpd_drivers.lenses import grbl as grbl_driver
-from elpd_drivers.lenses import tic as tic_driver
-from elpd_drivers.lenses import tic_wire as wire
+from elpd_drivers.sim.controllers import CONTROLLERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lens_rigs import KINDS, SPEED_SPS, Rig, open_rig, rig
+from lens_rigs import DIALECTS, KINDS, SPEED_SPS, Rig, open_rig, rig
 
 from elpd.errors import ConfigError, LensError, UsageError
 from elpd.records import LensFlag, StopMode
@@ -104,12 +104,15 @@ def test_an_abrupt_stop_bites_at_once(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(2000))
     made.live(60)
+    before_sps = made.motor.velocity_at(made.clock.now_ns())
     made.lens.stop(StopMode.ABRUPT)
-    made.clock.pass_ms(1)
+    made.clock.pass_ms(2)
+    assert made.motor.velocity_at(made.clock.now_ns()) < before_sps
+    made.live(made.dialect.hardest_stop_ms - 2)
     assert not made.moving
     made.live(100)
     referenced = LensFlag.REFERENCED in made.reports[-1].flags
-    assert referenced == made.lens.capabilities.abrupt_stop
+    assert referenced == made.dialect.abrupt_keeps_reference
 
 
 def test_a_stop_overtakes_a_reversal_that_waits(kind: str) -> None:
@@ -142,7 +145,7 @@ def test_a_stop_from_another_thread_wins_over_a_command_that_is_just_being_writt
     write, stops = made.port.write, []
 
     def write_late(data: bytes) -> None:
-        if data.startswith(b"$J") or b"\xe0" in data:
+        if made.dialect.moves(data):
             made.port.write = write  # type: ignore[method-assign]
             stops.append(made.lens.stop(StopMode.RAMPED))
         write(data)
@@ -175,6 +178,12 @@ def test_the_end_stop_behind_a_false_reference_is_not_ground_against(kind: str) 
     else:
         assert LensFlag.LIMIT in made.reports[-1].flags
         assert LensFlag.REFERENCED not in made.reports[-1].flags
+        with pytest.raises(LensError, match="home it first"):
+            made.lens.move_to(Steps(4000), SPEED_SPS)
+        made.lens.run(SPEED_SPS, made.soon(200))
+        made.live(300)
+        assert made.rotor > 500.0, "away from the switch it runs"
+        assert LensFlag.LIMIT not in made.reports[-1].flags
     assert not made.moving
     assert made.rotor >= -3.0
 
@@ -208,7 +217,7 @@ def test_homing_past_its_deadline_stops_and_says_so(kind: str) -> None:
     made = open_rig(kind, referenced=False)
     with pytest.raises(LensError, match="deadline"):
         made.lens.home(made.soon(100))
-    made.clock.pass_ms(5)
+    made.clock.pass_ms(made.dialect.hardest_stop_ms)
     assert not made.moving
 
 
@@ -221,7 +230,7 @@ def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
     with pytest.raises(LensError, match="limit"):
         made.live(200)
     assert made.clock.now_ns() - begun < 100e6
-    made.clock.pass_ms(2)
+    made.clock.pass_ms(made.dialect.hardest_stop_ms)
     assert not made.moving
     with pytest.raises(LensError):
         made.lens.run(SPEED_SPS, made.soon(100))
@@ -251,6 +260,84 @@ def test_an_unplugged_port_is_noticed_at_once_and_the_position_is_unknown(kind: 
     made.lens.close()
 
 
+def test_what_was_unplugged_and_plugged_in_again_can_be_opened_and_used(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.port.faults.disconnect_at_ns = made.clock.now_ns()
+    with pytest.raises(LensError, match="gone"):
+        made.live(5)
+    made.lens.close()
+    made.plug_in()
+    made.open()
+    made.live(200)
+    assert not made.moving, "what was moving is stopped by whoever connects"
+    rest = made.rotor
+    made.live(100)
+    assert made.rotor == rest, "nothing moves by itself"
+    made.lens.home(made.soon(10_000))
+    made.lens.move_to(Steps(1000), SPEED_SPS)
+    made.live(500)
+    assert made.rotor == pytest.approx(1000, abs=2.1)
+
+
+def test_an_alarm_in_motion_is_a_fault_from_which_homing_recovers(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    made.board.alarm_at(made.clock.now_ns())
+    with pytest.raises(LensError):
+        made.live(200)
+    made.live(made.dialect.hardest_stop_ms, lambda: None)
+    assert not made.moving
+    with pytest.raises(LensError):
+        made.lens.run(SPEED_SPS, made.soon(100))
+    made.lens.close()
+    made.port.faults.disconnect_at_ns = None
+    made.board.reset_at(made.clock.now_ns())
+    made.plug_in()
+    lens = made.open()
+    with pytest.raises(LensError, match="home it first"):
+        lens.move_to(Steps(1000), SPEED_SPS)
+    lens.home(made.soon(10_000))
+    lens.move_to(Steps(1000), SPEED_SPS)
+    made.live(500)
+    assert made.rotor == pytest.approx(1000, abs=2.1)
+
+
+def test_a_stop_leaves_at_once_while_a_reply_is_due(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.run(SPEED_SPS, made.soon(3000))
+    made.live(40)
+    write, written = made.port.write, []
+    made.port.write = lambda data: (written.append((made.clock.now_ns(), data)), write(data))  # type: ignore[method-assign]
+    made.live_until(lambda: bool(written), 20)  # a question has just left
+    asked, now = len(written), made.clock.now_ns()
+    stopper = threading.Thread(target=made.lens.stop, args=(StopMode.RAMPED,))
+    stopper.start()
+    stopper.join()
+    assert [at for at, _ in written[asked:]] == [now], "one write, at once"
+    made.live(250)
+    assert not made.moving
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=2.1)
+
+
+def test_wrong_checksums_are_never_believed(kind: str) -> None:
+    spoil = DIALECTS[kind].spoil
+    if spoil is None:
+        pytest.skip("the protocol has no checksums")
+    made = rig(kind, **DIALECTS[kind].config)
+    made.open(**DIALECTS[kind].settings)
+    made.live(20)
+    wrong = iter(range(3))
+    made.port.faults.garble = lambda data: data if next(wrong, None) is None else spoil(data)
+    made.live(150)
+    assert {report.steps for report in made.reports} == {3200.0}
+    made.port.faults.garble = spoil
+    with pytest.raises(LensError, match="limit"):
+        made.live(200)
+
+
 def test_a_board_that_restarts_in_motion_is_a_fault_and_comes_back_unreferenced(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -268,7 +355,7 @@ def test_a_motor_that_ignores_stops_is_a_runaway(kind: str) -> None:
     made = open_rig(kind, ignore_stop=True)
     made.lens.run(SPEED_SPS / 4, made.soon(3000))
     made.live(40)
-    made.lens.stop(StopMode.ABRUPT if kind == "tic" else StopMode.RAMPED)
+    made.lens.stop(StopMode.RAMPED if kind == "grbl" else StopMode.ABRUPT)
     with pytest.raises(LensError):
         made.live(600)
 
@@ -289,17 +376,14 @@ def test_nothing_but_garbage_stops_the_motor(kind: str) -> None:
     made.port.faults.garble = lambda data: b"\xa5" * (len(data) + 1)
     with pytest.raises(LensError):
         made.live(300)
-    made.clock.pass_ms(2)
+    made.clock.pass_ms(made.dialect.hardest_stop_ms)
     assert not made.moving
 
 
 def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_confirmed(kind: str) -> None:
     made = open_rig(kind)
     made.live(40)
-    if kind == "tic":
-        made.port.faults.garble = lambda d: (b"\0\0\7\0" + d[4:]) if len(d) == 8 else d
-    else:
-        made.port.faults.garble = lambda d: d.replace(b"MPos:-1.500", b"MPos:-0.200")
+    made.port.faults.garble = made.dialect.lie
     with pytest.raises(LensError, match="home it again"):
         made.live(100)
     assert made.rotor == 3200.0
@@ -307,20 +391,22 @@ def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_conf
 
 def test_what_an_earlier_session_had_asked_for_does_not_confuse_the_next(kind: str) -> None:
     made = rig(kind)
-    made.port.write(wire.encode(wire.GET_VARIABLE, bytes((0x22, 10))) if kind == "tic" else b"?")
+    made.port.write(made.dialect.question)
     made.open()
     made.live(20)
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(3200, abs=1.7)
 
 
 def test_another_board_on_the_port_is_refused(kind: str) -> None:
-    other = "grbl" if kind == "tic" else "tic"
-    made = rig(other)
-    driver = tic_driver if kind == "tic" else grbl_driver
-    with pytest.raises(LensError, match=r"answered|no answer|no GRBL"):
-        driver.open_lens({}, made.clock, made.port)
-    with pytest.raises(LensError, match="closed"):
-        made.port.write(b"x")
+    for other in KINDS:
+        if other == kind:
+            continue
+        made = rig(other)
+        with pytest.raises(LensError, match=r"answered|no answer|no GRBL"):
+            CONTROLLERS[kind].open_lens({}, made.clock, made.port)
+        with pytest.raises(LensError, match="closed"):
+            made.port.write(b"x")
+        assert made.rotor == 3200.0
 
 
 def test_nobody_there_is_a_clear_error(kind: str) -> None:
@@ -361,5 +447,5 @@ def test_any_bytes_from_the_line_end_in_a_lens_error_or_nothing(kind: str, data:
     try:
         made.live(60)
     except LensError:
-        made.clock.pass_ms(2)
+        made.clock.pass_ms(made.dialect.hardest_stop_ms)
         assert not made.moving

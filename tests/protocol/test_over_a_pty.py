@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import serial
 import ticlib
-from elpd_drivers.lenses import grbl as grbl_driver
-from elpd_drivers.lenses import tic as tic_driver
 from elpd_drivers.lenses.serial_port import SerialPort
+from elpd_drivers.sim.controllers import CONTROLLERS
 from lens_rigs import KINDS, SPEED_SPS, served
 from virtual import MonotonicClock
 
@@ -33,9 +32,8 @@ PATIENT = {"reply_ms": 2000.0}
 
 
 def open_lens(kind: str, port: str) -> Any:
-    if kind == "tic":
-        return tic_driver.open_lens({"port": port, **PATIENT}, CLOCK)
-    return grbl_driver.open_lens({"port": port, "trust_position": True, "connect_ms": 20_000.0, **PATIENT}, CLOCK)
+    more = {"trust_position": True, "connect_ms": 20_000.0} if kind == "grbl" else {}
+    return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more}, CLOCK, None)
 
 
 def poll_until(lens: Any, condition: Callable[[Any], bool], limit_s: float = 20.0) -> Any:
@@ -201,7 +199,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["marlin"], "known are grbl, tic"),
+        (["marlin"], "known are avr, grbl, tic, tmcl"),
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),

@@ -132,7 +132,8 @@ def test_the_same_calls_give_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "live_rms_um", "late_rms_um", "rest_um"), [("tic", 0.1, 0.1, 0.1), ("grbl", 1.0, 0.4, 0.6)]
+    ("kind", "live_rms_um", "late_rms_um", "rest_um"),
+    [("tic", 0.1, 0.1, 0.1), ("grbl", 1.0, 0.4, 0.6), ("tmcl", 0.4, 0.3, 0.1)],
 )
 def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms_um: float, rest_um: float) -> None:
     assert kind in KINDS
@@ -159,7 +160,7 @@ def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms
         made.lens.run(-way * SPEED_SPS, made.soon(900))
         made.live(260, ask)
         stopped = made.clock.now_ns()
-        made.lens.stop(StopMode.ABRUPT if kind == "tic" else StopMode.RAMPED)
+        made.lens.stop(StopMode.ABRUPT if made.lens.capabilities.abrupt_stop else StopMode.RAMPED)
         made.live(180, ask)
 
         truth = made.truth(asked)

@@ -14,24 +14,17 @@ in the position, until the lens is homed. Steps count from the lower end of GRBL
 
 from __future__ import annotations
 
-import threading
 from collections import deque
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
-from elpd.motion.trajectory import REST, Motion, Timing, Trajectory
+from elpd.motion.trajectory import REST, Motion, Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
-from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
-from elpd_drivers.lenses.axis import (
-    ADAPTER_LATENCY_SIGMA_US,
-    ADAPTER_LATENCY_US,
-    check_speed,
-    check_target,
-    limits_from,
-    read_settings,
-    run_target,
-)
+from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
+from elpd_drivers.lenses.asking import Asking
+from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, run_target
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
     ALARM_WORDS,
@@ -44,15 +37,18 @@ from elpd_drivers.lenses.grbl_lines import (
     jog_line,
     parse_status,
 )
-from elpd_drivers.lenses.latched import LatchedPort
+from elpd_drivers.lenses.line import Trouble, open_on_line
+from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensLimits, PositionEstimate
+    from elpd_drivers.lenses.line import Line
 
 SEGMENT_S = 0.010
+STOPS_TRIED = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,51 +65,27 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     Raises ``ConfigError`` for a wrong table, ``LensError`` if there is no GRBL 1.1 or its settings do not fit.
     """
-    table = read_settings(GrblLensSettings, settings, "lens")
-    if port is None:
-        from elpd_drivers.lenses.serial_port import SerialPort  # noqa: PLC0415  (needs pyserial, in-memory use does not)
-
-        port = SerialPort(table.port, table.baud)
-        if "latency_us" not in settings:
-            table = replace(table, latency_us=ADAPTER_LATENCY_US, latency_sigma_us=ADAPTER_LATENCY_SIGMA_US)
-    lens = GrblLens(table, clock, port)
-    try:
-        lens.connect()
-    except BaseException:
-        port.close()
-        raise
-    return lens
+    return open_on_line(GrblLensSettings, settings, clock, port, lambda table, line: GrblLens(table, clock, line))
 
 
 class GrblLens:
     """``elpd.ports.Lens`` on GRBL. Use ``open_lens``."""
 
-    def __init__(self, settings: GrblLensSettings, clock: Clock, port: BytePort) -> None:
-        self._settings, self._clock, self._port = settings, clock, LatchedPort(port)
-        self._name = settings.port or "(in memory)"
-        self._byte_ns = 10 * NS_PER_S // settings.baud
+    def __init__(self, settings: GrblLensSettings, clock: Clock, line: Line) -> None:
+        self._settings, self._clock, self._line = settings, clock, line
         self._lines = LineReader()
-        self._lock = threading.Lock()
-        self._line_free_ns = 0
-        self._query_ns: int | None = None
+        self._asking = Asking(settings.query_ms, settings.reply_ms, lost_share=1 / 3)
         self._sampled_from_ns = 0
-        self._unanswered_since_ns: int | None = None
-        self._next_query_ns = 0
         self._read_ns = self._line_begun_ns = self._line_end_ns = 0
         self._unacknowledged: deque[int | None] = deque()
         self._status: Status | None = None
-        self._report: LensReport | None = None
         self._wish: _Wish | None = None
         self._cruise_sps = 0.0
         self._stopping = False
         self._resetting = self._locked_by_stop = False
-        self._referenced = False
-        self._implausible = 0
-        self._rest_due_ns: int | None = None
-        self._stops = self._stops_ignored = 0
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
-        self._trajectory = self._new_trajectory()
+        self._motor = self._new_motor()
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -137,97 +109,106 @@ class GrblLens:
 
     def connect(self) -> None:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
-        board = handshake(self._port, self._clock, self._settings)
-        self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
-        self._trajectory = self._new_trajectory()
-        self._referenced = board.idle and self._settings.trust_position and not board.restarted
-        due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
-        while self._poll(fuse=True) is None:
-            self._wait(due, "no report after connecting; check the cable")
+        with self._guarded():
+            board = handshake(self._line, self._clock, self._settings)
+            self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
+            self._motor = self._new_motor()
+            self._motor.referenced = board.idle and self._settings.trust_position and not board.restarted
+            due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
+            while self._poll(fuse=True) is None:
+                self._wait(due, "no report after connecting; check the cable")
 
     def home(self, deadline: HostNs) -> LensReport:
         """Run GRBL's homing cycle (``$H``), return at rest beside the switch."""
-        self._port.check()
-        if self._report is not None and self._report.moving:
-            self.stop(StopMode.RAMPED)
-            self._await_idle(deadline)
-        self._referenced, self._wish, self._rest_due_ns = False, None, None
-        self._send(b"$H\n", None)
-        self._query_ns = self._unanswered_since_ns = None
-        while self._unacknowledged:
-            self._take_lines(fuse=False)
-            self._wait(deadline, "homing did not end before its deadline; check the limit switch, or allow more time")
-        self._next_query_ns = 0
-        report = None
-        while report is None:
-            report = self._poll(fuse=False)
-            self._wait(deadline, "no report after homing; check the cable")
-        if self._status is None or self._status.state != "Idle":
-            raise self._trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
-        with self._lock:
-            self._trajectory.begin(report)
-        self._referenced, self._locked_by_stop = True, False
-        return self._flagged(report)
+        with self._guarded():
+            return self._home(deadline)
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move; first to standstill, if something else is under way."""
-        self._port.check()
+        self._line.check()
         check_target(target, self._limits)
         check_speed(speed_sps, self._limits)
-        if not self._referenced:
+        if not self._motor.referenced:
             raise LensError(f"lens: cannot move to {target} steps, its position is unknown; home it first")
         return self._begin(_Wish(abs(speed_sps), target=int(target)), "move_to")
 
     def run(self, velocity_sps: float, until: HostNs) -> CommandStamp:
         """Jog towards a limit, or as far as the time until *until* allows; first to standstill, if moving otherwise."""
-        self._port.check()
+        self._line.check()
         check_speed(velocity_sps, self._limits)
         return self._begin(_Wish(velocity_sps, until_ns=until), "run")
 
     def stop(self, mode: StopMode) -> CommandStamp:
         """Write the stop byte now, from any thread. ``ABRUPT`` is a reset: the position is lost if in motion."""
-        self._stops += 1
+        self._motor.stops += 1
         self._wish = None
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
             self._resetting = self._locked_by_stop = True
-        begun = self._clock.now_ns()
-        self._port.write(data)
-        done = self._clock.now_ns()
-        with self._lock:
-            self._note_stop(mode, begun)
-        return CommandStamp(f"stop {mode.name.lower()}", begun, done)
+        sent = self._line.send(data)
+        self._note_stop(mode, sent.off_wire_ns)
+        return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 
     def poll(self) -> LensReport | None:
         """Ask when due, read what has come, take the next step of a reversal; return a new report if there is one."""
-        self._port.check()
-        report = self._poll(fuse=True)
-        self._take_next_step()
-        return None if report is None else self._flagged(report)
+        with self._guarded():
+            report = self._poll(fuse=True)
+            self._take_next_step()
+            return None if report is None else self._flagged(report)
 
     def position_at(self, when: HostNs) -> PositionEstimate:
         """Return where the motor was at *when*."""
-        with self._lock:
-            return self._trajectory.position_at(when)
+        return self._motor.position_at(when)
 
     def close(self) -> None:
         """Stop if moving, and give the port back. Idempotent."""
         try:
-            if self._report is None or self._report.moving or self._rest_due_ns is not None:
-                self._port.write(CANCEL)
+            if self._motor.report is None or self._motor.under_way:
+                self._line.send(CANCEL)
         except LensError:
             pass  # the line is dead: the jog ends at its target
-        self._port.close()
+        self._line.close()
+
+    # --- homing ----------------------------------------------------------------------------------------------------
+
+    def _home(self, deadline: HostNs) -> LensReport:
+        if self._motor.report is not None and self._motor.report.moving:
+            self.stop(StopMode.RAMPED)
+            self._await_idle(deadline)
+        self._motor.referenced, self._motor.rest_due_ns, self._wish = False, None, None
+        self._unacknowledged.append(None)
+        self._line.send(b"$H\n")
+        self._asking.forget()
+        while self._unacknowledged:
+            self._take_lines(fuse=False)
+            self._wait(deadline, "homing did not end before its deadline; check the limit switch, or allow more time")
+        report = None
+        while report is None:
+            report = self._poll(fuse=False)
+            self._wait(deadline, "no report after homing; check the cable")
+        if self._status is None or self._status.state != "Idle":
+            raise Trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
+        self._motor.begin(report)
+        self._motor.referenced, self._locked_by_stop = True, False
+        return self._flagged(report)
+
+    def _await_idle(self, deadline: HostNs) -> None:
+        while True:
+            self._poll(fuse=self._motor.known)
+            ended = self._status is not None and self._status.state in {"Idle", "Alarm"}
+            if ended and self._motor.rest_due_ns is None:
+                return
+            self._wait(deadline, "the motor did not come to rest; look at the board")
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
     def _begin(self, wish: _Wish, name: str) -> CommandStamp:
         """Jog now if at rest; else cancel, and let ``poll`` jog when the motor stands."""
-        now, stops = self._clock.now_ns(), self._stops
+        now, stops = self._clock.now_ns(), self._motor.stops
         if not self._busy():
             return self._jog(wish, name, stops)
         if wish.target is None and wish.speed_sps == self._cruise_sps and not self._stopping:
-            due = self._rest_due_ns or now
+            due = self._motor.rest_due_ns or now
             if due <= wish.until_ns:
                 return CommandStamp(name, now, now)  # already running so, and ending in time
         stamp = CommandStamp(name, now, now) if self._stopping else self.stop(StopMode.RAMPED)
@@ -235,58 +216,50 @@ class GrblLens:
         return CommandStamp(name, stamp.begun_ns, stamp.done_ns)
 
     def _busy(self) -> bool:
-        return self._rest_due_ns is not None or bool(self._unacknowledged)
+        return self._motor.rest_due_ns is not None or bool(self._unacknowledged)
 
     def _jog(self, wish: _Wish, name: str, stops: int) -> CommandStamp:
         if self._status is not None and self._status.state == "Alarm":
             raise LensError("lens: GRBL is locked (Alarm), its position is unknown; home it first")
         now = self._clock.now_ns()
-        with self._lock:
-            steps = self._trajectory.position_at(now).steps
+        steps, _ = self._motor.state_at(now)
         target = wish.target
         if target is None:
             spare_ns = wish.until_ns - now - 15 * NS_PER_MS  # the line's own time, and the planner's
-            target = run_target(steps, 0.0, wish.speed_sps, spare_ns, self._limits, referenced=self._referenced)
+            referenced = self._motor.referenced
+            target = run_target(steps, 0.0, wish.speed_sps, spare_ns, self._limits, referenced=referenced)
         if target == round(steps):
             return CommandStamp(name, now, now)
         speed_sps = abs(wish.speed_sps)
         line = jog_line(target / self._steps_per_mm - self._travel_mm, speed_sps / self._steps_per_mm * 60)
-        begun = self._clock.now_ns()
-        with self._lock:
-            effective = self._on_wire(len(line), begun) + 2 * NS_PER_MS
-            motion = Motion(self._limits.acceleration_sps2, 0.0, float(target), speed_sps, SEGMENT_S)
-            number = self._trajectory.command(motion, effective, 2 * NS_PER_MS)
-            self._rest_due_ns = (self._trajectory.at_rest_from() or effective) + 100 * NS_PER_MS
+        sent = self._line.send(line)
+        motion = Motion(self._limits.acceleration_sps2, 0.0, float(target), speed_sps, SEGMENT_S)
+        number = self._motor.command(motion, sent.off_wire_ns + 2 * NS_PER_MS, 2 * NS_PER_MS)
         self._unacknowledged.append(number)
-        self._port.write(line)
-        done = self._clock.now_ns()
-        self._cruise_sps, self._stopping, self._stops_ignored = wish.speed_sps, False, 0
-        if self._stops != stops:
+        self._cruise_sps, self._stopping, self._motor.stops_ignored = wish.speed_sps, False, 0
+        if self._motor.stops != stops:
             self.stop(StopMode.RAMPED)  # one came from another thread while this was on its way: it wins
-        return CommandStamp(name, begun, done)
+        return CommandStamp(name, sent.begun_ns, sent.done_ns)
 
-    def _note_stop(self, mode: StopMode, begun: int) -> None:
-        sent = self._on_wire(1, begun)
-        if not self._trajectory.known:
+    def _note_stop(self, mode: StopMode, sent_ns: int) -> None:
+        motor = self._motor
+        if not motor.known:
             return
         if mode is StopMode.ABRUPT:
-            moving = self._busy() or (self._report is not None and self._report.moving)
-            self._referenced = self._referenced and not moving
+            moving = self._busy() or (motor.report is not None and motor.report.moving)
+            motor.referenced = motor.referenced and not moving
             self._unacknowledged.clear()
-            self._trajectory.command(REST, sent + 20 * NS_PER_US, 50 * NS_PER_US)
-            self._rest_due_ns = sent + 50 * NS_PER_MS
+            motor.command(REST, sent_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
         elif not self._stopping and self._busy():
-            onset_ns = round(self._settings.stop_onset_ms * NS_PER_MS)
-            braking = Motion(self._limits.acceleration_sps2, segment_s=SEGMENT_S)
-            ending = self._trajectory.at_rest_from()
-            if ending is None or ending > sent + onset_ns:
-                sigma_ns = self._settings.stop_onset_sigma_ms * NS_PER_MS
-                self._trajectory.command(braking, sent + onset_ns, sigma_ns)
-            self._rest_due_ns = (self._trajectory.at_rest_from() or sent + onset_ns) + 60 * NS_PER_MS
+            onset_ns = sent_ns + round(self._settings.stop_onset_ms * NS_PER_MS)
+            ending = motor.planned_rest_ns
+            if ending is None or ending > onset_ns:
+                braking = Motion(self._limits.acceleration_sps2, segment_s=SEGMENT_S)
+                motor.command(braking, onset_ns, self._settings.stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
         self._stopping = True
 
     def _take_next_step(self) -> None:
-        stops = self._stops
+        stops = self._motor.stops
         if self._wish is None or self._busy():
             return
         wish, self._wish = self._wish, None
@@ -297,34 +270,22 @@ class GrblLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = self._take_lines(fuse=fuse)
         now = self._clock.now_ns()
-        if self._unanswered_since_ns is not None:
-            silence_ms = (now - self._unanswered_since_ns) / NS_PER_MS
-            if silence_ms > self._settings.reply_ms:
-                raise self._trouble(
-                    f"no valid status report for {silence_ms:.0f} ms (limit {self._settings.reply_ms:.0f}); check the "
-                    "cable, or raise lens.reply_ms"
-                )
-        lost = self._query_ns is not None and now - self._query_ns > self._settings.reply_ms * NS_PER_MS / 3
-        if lost or (self._query_ns is None and now >= self._next_query_ns):
-            self._port.write(STATUS)
-            with self._lock:
-                self._sampled_from_ns = self._on_wire(1, now)
-            self._query_ns = now
-            self._next_query_ns = now + round(self._settings.query_ms * NS_PER_MS)
-            if self._unanswered_since_ns is None:
-                self._unanswered_since_ns = now
+        self._asking.check(now, "")
+        if self._asking.due(now):
+            self._sampled_from_ns = self._line.send(STATUS).off_wire_ns
+            self._asking.asked(now)
         return report
 
     def _take_lines(self, *, fuse: bool) -> LensReport | None:
         """Read and act on every complete line; return the newest report."""
-        data = self._port.read_available()
+        data = self._line.read()
         before, now = self._read_ns, self._clock.now_ns()
         self._read_ns = now
         newest = None
         for line, bytes_after in self._lines.feed(data):
             # when the line's first byte can have left the board, at the latest
-            length_ns = (len(line) + 2) * self._byte_ns
-            begun = now - length_ns - bytes_after * self._byte_ns
+            length_ns = (len(line) + 2) * self._line.byte_ns
+            begun = now - length_ns - bytes_after * self._line.byte_ns
             if line.startswith("<"):
                 status = parse_status(line)
                 newest = (self._take_status(status, begun, fuse=fuse) if status else None) or newest
@@ -347,35 +308,33 @@ class GrblLens:
         if number is None:
             return
         width = max(latest - earliest, 0)
-        with self._lock:
-            self._trajectory.amend(number, latest - width // 2, max(width / 12**0.5, 100 * NS_PER_US))
-            if not self._stopping:
-                self._rest_due_ns = (self._trajectory.at_rest_from() or latest) + 100 * NS_PER_MS
+        sigma_ns = max(width / 12**0.5, 100 * NS_PER_US)
+        self._motor.amend(number, latest - width // 2, sigma_ns, still_ending=not self._stopping)
         if self._stopping:
-            self._port.write(CANCEL)  # the first one may have come before there was anything to cancel
+            self._line.send(CANCEL)  # the first one may have come before there was anything to cancel
 
     def _heed(self, line: str) -> None:
         """Act on what the board says by itself."""
         if line.startswith("ALARM:"):
             if self._resetting:
                 return
-            raise self._trouble(f"GRBL raised {line} ({ALARM_WORDS.get(line[6:], 'unknown')}); clear the cause, home")
+            raise Trouble(f"GRBL raised {line} ({ALARM_WORDS.get(line[6:], 'unknown')}); clear the cause, home")
         if line.startswith("error:"):
             if self._unacknowledged:
                 self._unacknowledged.popleft()
             words = ERROR_WORDS.get(line[6:], "unknown")
-            raise self._trouble(f"GRBL refused a command with {line} ({words}); compare its $$ with the config")
+            raise Trouble(f"GRBL refused a command with {line} ({words}); compare its $$ with the config")
         if "Grbl" in line or "GrblHAL" in line:
             if not self._resetting:
-                raise self._trouble("the board restarted by itself (its banner came); check its supply, then home")
+                raise Trouble("the board restarted by itself (its banner came); check its supply, then home")
             self._resetting = False
 
     def _take_status(self, status: Status, begun: int, *, fuse: bool) -> LensReport | None:
-        if self._query_ns is None:
+        if not self._asking.open:
             return None  # late or duplicate: its instant of sampling is unknown
-        self._query_ns = None
+        self._asking.answered()
         if status.state == "Alarm" and self._busy() and not self._locked_by_stop and not self._unacknowledged:
-            raise self._trouble("GRBL fell into Alarm during a motion; clear the cause, home")
+            raise Trouble("GRBL fell into Alarm during a motion; clear the cause, home")
         moving = status.state in {"Jog", "Run", "Home", "Hold:1"}
         velocity = None if moving else 0.0
         earliest = self._sampled_from_ns
@@ -386,98 +345,56 @@ class GrblLens:
             velocity,
             LensFlag.MOVING if moving else LensFlag.NONE,
         )
-        if fuse and not self._believe(report):
-            self._next_query_ns = 0
+        if fuse and not self._motor.believes(report):
+            self._asking.soon()
             return None
-        self._unanswered_since_ns = None
-        self._status, self._report = status, report
+        self._asking.believed()
+        self._status, self._motor.report = status, report
         self._watch_motion(report)
         return report
 
-    def _believe(self, report: LensReport) -> bool:
-        """Learn from a report, unless it is impossible; raise when the impossible is confirmed."""
-        with self._lock:
-            if not self._trajectory.known:
-                self._trajectory.begin(report)
-                return True
-            if self._resetting:
-                return False
-            surprise = self._trajectory.expect(report)
-            limit = 8 * surprise.sigma_steps + 32
-            if abs(surprise.steps) <= limit:
-                self._implausible = 0
-                self._trajectory.observe(report)
-                return True
-        self._implausible += 1
-        if self._implausible >= 3:
-            raise self._trouble(
-                f"the controller reports a position {surprise.steps:+.0f} steps from where it must be "
-                f"(limit {limit:.0f}), {self._implausible} times in a row; home it again"
-            )
-        return False
-
     def _watch_motion(self, report: LensReport) -> None:
         """Believe in rest when it is reported; stop again, harder each time, what should be at rest by now."""
-        if self._rest_due_ns is None:
+        motor = self._motor
+        if motor.rest_due_ns is None:
             return
-        with self._lock:
-            planned = self._trajectory.at_rest_from()
+        planned = motor.planned_rest_ns
         if not report.moving and not self._unacknowledged and (planned is None or report.earliest_ns > planned):
-            self._rest_due_ns, self._stopping, self._stops_ignored = None, False, 0
-            return
-        if not report.moving or report.earliest_ns < self._rest_due_ns:
-            return
-        self._stops_ignored += 1
-        if self._stops_ignored > 3:
-            raise self._trouble(f"the motor still runs after {self._stops_ignored - 1} stops; the board was reset")
-        self._port.write(CANCEL)
-        self._stopping = True
+            motor.at_rest()
+            self._stopping = False
+        elif motor.overdue(report):
+            if motor.stops_ignored > STOPS_TRIED:
+                raise Trouble(f"the motor still runs after {STOPS_TRIED} stops; the board was reset")
+            self._line.send(CANCEL)
+            self._stopping = True
 
     def _flagged(self, report: LensReport) -> LensReport:
-        flags = report.flags | (LensFlag.REFERENCED if self._referenced else LensFlag.POSITION_UNCERTAIN)
+        flags = LensFlag.NONE
         if self._status is not None and "X" in self._status.pins:
             flags |= LensFlag.LIMIT
         if self._status is not None and self._status.state == "Alarm":
             flags |= LensFlag.ALARM
-        return LensReport(report.steps, report.earliest_ns, report.latest_ns, report.velocity_sps, flags)
+        return self._motor.flagged(report, flags)
 
-    def _new_trajectory(self) -> Trajectory:
+    def _new_motor(self) -> Motor:
         sigma_ns = round(self._settings.latency_sigma_us * NS_PER_US)
         quantum = 0.001 * self._steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
-        return Trajectory(
-            Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum, rest_quantum_steps=quantum, ramp_steps=1.5),
-            floor_steps=0.3,
-        )
-
-    def _await_idle(self, deadline: HostNs) -> Status:
-        while True:
-            self._poll(fuse=self._trajectory.known)
-            if self._status is not None and self._status.state in {"Idle", "Alarm"} and self._rest_due_ns is None:
-                return self._status
-            self._wait(deadline, "the motor did not come to rest; look at the board")
-
-    # --- the wire --------------------------------------------------------------------------------------------------
-
-    def _send(self, line: bytes, number: int | None) -> None:
-        with self._lock:
-            self._on_wire(len(line), self._clock.now_ns())
-        self._unacknowledged.append(number)
-        self._port.write(line)
-
-    def _on_wire(self, count: int, begun: int) -> int:
-        """Return when the last of *count* bytes written at *begun* leaves the wire, behind those before it."""
-        self._line_free_ns = max(self._line_free_ns, begun) + count * self._byte_ns
-        return self._line_free_ns
+        timing = Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum, rest_quantum_steps=quantum, ramp_steps=1.5)
+        return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=0.3)
 
     def _wait(self, deadline: HostNs, why: str) -> None:
         now = self._clock.now_ns()
         if now >= deadline:
-            raise self._trouble(why)
+            raise Trouble(why)
         self._clock.sleep_until(after_ms(now, 1))
 
-    def _trouble(self, what: str) -> LensError:
-        """Reset the board, latch, forget the reference; return what to raise."""
-        self._wish = None
-        self._referenced = False
-        return self._port.trouble(what, RESET, "reset")
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Around everything that can meet trouble: the reset goes out, the fault stays, the reference is gone."""
+        with self._line.stopping_on_trouble(lambda: RESET, "reset"):
+            try:
+                yield
+            except Trouble:
+                self._motor.referenced, self._wish = False, None
+                raise

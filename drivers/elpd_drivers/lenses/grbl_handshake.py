@@ -15,8 +15,9 @@ from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, LineReader, Status, parse_status
 
 if TYPE_CHECKING:
-    from elpd.ports import BytePort, Clock
+    from elpd.ports import Clock
     from elpd.records import LensLimits
+    from elpd_drivers.lenses.line import Line
 
 _VERSIONS = ("[VER:1.1",)
 
@@ -59,37 +60,38 @@ class BoardFacts:
     restarted: bool
 
 
-def handshake(port: BytePort, clock: Clock, settings: GrblLensSettings) -> BoardFacts:
+def handshake(line: Line, clock: Clock, settings: GrblLensSettings) -> BoardFacts:
     """Identify the board, stop it if it moves, and read its settings.
 
     Raises ``LensError`` if there is no GRBL 1.1, ``ConfigError`` if its settings contradict the config.
     """
-    return _Handshake(port, clock, settings).run()
+    return _Handshake(line, clock, settings).run()
 
 
 class _Handshake:
-    def __init__(self, port: BytePort, clock: Clock, settings: GrblLensSettings) -> None:
-        self._port, self._clock, self._settings = port, clock, settings
-        self._name = settings.port or "(in memory)"
+    def __init__(self, line: Line, clock: Clock, settings: GrblLensSettings) -> None:
+        self._line, self._clock, self._settings = line, clock, settings
         self._lines = LineReader()
         self._restarted = False
 
     def run(self) -> BoardFacts:
-        self._port.read_available()
+        self._line.read()
         status = self._status()
         due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
         while status.state not in {"Idle", "Alarm"}:
             # somebody else's motion; what a cancel does not end (a hold), a reset does
             now = self._clock.now_ns()
             if now >= after_ms(due, self._settings.connect_ms):
-                raise LensError(f"lens port {self._name}: GRBL stays in state {status.state}; switch it off and on")
-            self._port.write(CANCEL if now < due else RESET)
+                raise LensError(
+                    f"lens port {self._line.name}: GRBL stays in state {status.state}; switch it off and on"
+                )
+            self._line.send(CANCEL if now < due else RESET)
             self._clock.sleep_until(after_ms(now, 100))
             status = self._status()
         version = self._ask("$I", "[VER:")
         if not any(line.startswith(_VERSIONS) for line in version):
             raise LensError(
-                f"lens port {self._name}: this driver speaks GRBL 1.1, the board says {' '.join(version)[:80]!r}; "
+                f"lens port {self._line.name}: this driver speaks GRBL 1.1, the board says {' '.join(version)[:80]!r}; "
                 "update its firmware, or choose another lens.board"
             )
         board = self._numbers(self._ask("$$", "$"))
@@ -106,16 +108,16 @@ class _Handshake:
             now = self._clock.now_ns()
             if now >= due:
                 raise LensError(
-                    f"lens port {self._name}: no GRBL answered within {self._settings.connect_ms:.0f} ms (saw "
+                    f"lens port {self._line.name}: no GRBL answered within {self._settings.connect_ms:.0f} ms (saw "
                     f"{seen!r}); check power, cable, baud ({self._settings.baud}) and lens.board"
                 )
             if now >= reset_at:
-                self._port.write(RESET)
+                self._line.send(RESET)
                 self._restarted, reset_at = True, due
             if now >= ask_at:
-                self._port.write(STATUS)
+                self._line.send(STATUS)
                 ask_at = after_ms(now, 100)
-            for line, _ in self._lines.feed(self._port.read_available()):
+            for line, _ in self._lines.feed(self._line.read()):
                 status = parse_status(line)
                 if status is not None:
                     return status
@@ -125,22 +127,22 @@ class _Handshake:
 
     def _ask(self, line: str, beginning: str) -> list[str]:
         """Send a line and collect the lines that begin so, up to its ``ok``."""
-        self._port.write(f"{line}\n".encode("ascii"))
+        self._line.send(f"{line}\n".encode("ascii"))
         patience_ms = 10 * self._settings.reply_ms
         due = after_ms(self._clock.now_ns(), patience_ms)
         answers: list[str] = []
         while True:
-            for got, _ in self._lines.feed(self._port.read_available()):
+            for got, _ in self._lines.feed(self._line.read()):
                 if got == "ok":
                     return answers
                 if got.startswith(beginning):
                     answers.append(got)
                 elif got.startswith("error:"):
-                    raise LensError(f"lens port {self._name}: GRBL answers {line} with {got}; is it GRBL 1.1?")
+                    raise LensError(f"lens port {self._line.name}: GRBL answers {line} with {got}; is it GRBL 1.1?")
             now = self._clock.now_ns()
             if now >= due:
                 raise LensError(
-                    f"lens port {self._name}: no answer to {line} within {patience_ms:.0f} ms; check the cable"
+                    f"lens port {self._line.name}: no answer to {line} within {patience_ms:.0f} ms; check the cable"
                 )
             self._clock.sleep_until(after_ms(now, 1))
 
@@ -155,7 +157,9 @@ class _Handshake:
                 continue
         missing = [f"${number}" for number in (100, 110, 120, 130) if board.get(number, 0.0) <= 0.0]
         if missing:
-            raise LensError(f"lens port {self._name}: the board does not tell {', '.join(missing)}; is it GRBL 1.1?")
+            raise LensError(
+                f"lens port {self._line.name}: the board does not tell {', '.join(missing)}; is it GRBL 1.1?"
+            )
         return board
 
 

@@ -16,22 +16,20 @@ Consecutive blocks do not blend: each ends at rest. Overrides are accepted and h
 from __future__ import annotations
 
 import random
-import time
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from elpd.motion.kinematics import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from elpd_drivers.sim.boards import grbl_text as text
+from elpd_drivers.sim.boards.axis import last_step
 from elpd_drivers.sim.boards.grbl_text import GrblError, GrblSettings
-from elpd_drivers.sim.boards.line import PtyServer
-from elpd_drivers.sim.boards.settings import lens_and_config
+from elpd_drivers.sim.boards.served import ServedBoard
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
-    from elpd.ports import RunningBoard
     from elpd_drivers.sim.lens import SimulatedLens
 
 SEGMENT_S = 0.010
@@ -189,6 +187,13 @@ class GrblBoard:
         self._offset = -round(self.lens.pulses_at(at_ns + NS_PER_MS))
         self._state = "Alarm" if self.settings[22] else "Idle"
         self._say_hello(at_ns + 500 * NS_PER_MS)
+
+    def alarm_at(self, at_ns: int) -> None:
+        """Let a limit switch be pressed at *at_ns*: the pulses stop, and the board says no more until it is reset."""
+        self.advance_to(at_ns)
+        self.lens.halt(at_ns)
+        self._alarm(1, at_ns)
+        self._silent = True
 
     def _lines_wait(self) -> bool:
         """Say whether the main loop is elsewhere: homing, suspended by a hold or cancel, or dead after an alarm."""
@@ -514,8 +519,7 @@ class GrblBoard:
 
     def _report(self, at_ns: int) -> None:
         pulses, velocity = self.lens.pulses_at(at_ns), self.lens.velocity_at(at_ns)
-        # the count of a moving axis is the last step that was made
-        count = pulses // 1 if velocity > 0 else -(-pulses // 1) if velocity < 0 else round(pulses)
+        count = last_step(pulses, velocity)
         feed = 0.0
         if self._motion is not None:
             _, ahead_sps = state_at(self._motion.profile, self._motion.prepared_until_ns(at_ns))
@@ -539,13 +543,5 @@ class GrblBoard:
         self._output.append((at_ns, f"{line}\r\n".encode("ascii")))
 
 
-class _Board:
-    """The entry point ``elpd.boards: grbl``."""
-
-    def serve(self, settings: Mapping[str, Any]) -> RunningBoard:
-        """Serve a GRBL in front of a lens; see ``boards.settings`` for the keys."""
-        lens, config, seed = lens_and_config(settings, GrblConfig)
-        return PtyServer(GrblBoard(lens, config, seed=seed, begin_ns=time.monotonic_ns()))
-
-
-BOARD = _Board()
+BOARD = ServedBoard(GrblBoard, GrblConfig)
+"""The entry point ``elpd.boards: grbl``."""

@@ -9,17 +9,16 @@ microsteps/s per 100 s.
 
 from __future__ import annotations
 
-import math
 import random
-import time
-from collections import deque
 from dataclasses import dataclass
-from enum import Enum, IntEnum, IntFlag
-from typing import TYPE_CHECKING, Any
+from enum import IntEnum, IntFlag
+from functools import partial
+from typing import TYPE_CHECKING
 
 from elpd.units import NS_PER_MS, NS_PER_S
-from elpd_drivers.sim.boards.line import PtyServer
-from elpd_drivers.sim.boards.settings import lens_and_config
+from elpd_drivers.sim.boards.agenda import Agenda
+from elpd_drivers.sim.boards.axis import Axis, Happened, Search, last_step
+from elpd_drivers.sim.boards.served import ServedBoard
 from elpd_drivers.sim.boards.tic_words import (
     BLOCK,
     CLEARS_SERIAL_ERROR,
@@ -34,9 +33,6 @@ from elpd_drivers.sim.boards.tic_words import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from elpd.ports import RunningBoard
     from elpd_drivers.sim.lens import SimulatedLens
 
 SPEED_UNIT = 10_000
@@ -76,12 +72,6 @@ class _Input(IntEnum):
     HALT = 2
     POSITION = 3
     VELOCITY = 4
-
-
-class _Homing(Enum):
-    NO = "no"
-    TOWARDS = "towards"
-    AWAY = "away"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,15 +122,14 @@ class TicBoard:
         self.byte_ns = round(10 * NS_PER_S / self.config.baud)
         self._random = random.Random(seed)  # noqa: S311  (latency, not secrets)
         self._frame = bytearray()
-        self._pending: deque[tuple[int, int, bytes]] = deque()
         self._output: list[tuple[int, bytes]] = []
-        self._now_ns = self._begin_ns = begin_ns
-        self._timeout_ns: int | None = None
-        self._switch_ns: int | None = None
+        self._begin_ns = begin_ns
+        self._agenda = Agenda(begin_ns)
+        self._axis = Axis(lens, switches=self.config.limit_switches)
         self._errors = self._occurred = TicError(0)
-        self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
-        self._target = self._offset = 0
-        self._uncertain, self._home_forward = True, False
+        self._plan, self._input = _Plan.OFF, _Input.HALT
+        self._target = 0
+        self._uncertain = True
         self._max_speed = self._max_acceleration = self._max_deceleration = self._starting_speed = 0
         self._seven_bit: dict[int, int] = {}
         self._power_up(begin_ns, referenced=self.config.referenced)
@@ -161,26 +150,8 @@ class TicBoard:
 
     def advance_to(self, when_ns: int) -> None:
         """Let pending commands, the timeout and the limit switches happen, in the order of their times."""
-        while True:
-            events = [(self._pending[0][0], 0)] if self._pending else []
-            if self._timeout_ns is not None:
-                events.append((self._timeout_ns, 1))
-            if self._switch_ns is not None:
-                events.append((self._switch_ns, 2))
-            due, kind = min(events, default=(when_ns + 1, 0))
-            if due > when_ns:
-                break
-            self._now_ns = max(due, self._now_ns)
-            if kind == 0:
-                _, command, payload = self._pending.popleft()
-                self._execute(command, payload, due)
-            elif kind == 1:
-                self._timeout_ns = None
-                self._raise_errors(TicError.COMMAND_TIMEOUT)
-            else:
-                self._switch(due)
-        self._now_ns = max(when_ns, self._now_ns)
-        self.lens.advance(self._now_ns)
+        self._agenda.run_until(when_ns)
+        self.lens.advance(self._agenda.now_ns)
 
     def take_output(self) -> list[tuple[int, bytes]]:
         """Return (and forget) the responses, each with the instant at which it was handed to the wire."""
@@ -191,8 +162,15 @@ class TicBoard:
         """Let the supply brown out at *at_ns*: everything forgotten, motor halted, position unknown."""
         self.advance_to(at_ns)
         self.lens.halt(at_ns)
-        self._pending.clear()
+        self._agenda.clear()
         self._power_up(at_ns, referenced=False)
+
+    def alarm_at(self, at_ns: int) -> None:
+        """Let the motor driver fail at *at_ns*: coils off, position unknown; it works again after the next command."""
+        self.advance_to(at_ns)
+        self._raise_errors(TicError.DRIVER, at_ns)
+        self._halt(at_ns)
+        self._uncertain = True
 
     # --- framing ---------------------------------------------------------------------------------------------------
 
@@ -221,8 +199,8 @@ class TicBoard:
 
     def _queue(self, command: int, payload: bytes, at_ns: int) -> None:
         """Let a command take effect after the firmware's latency, and never before an earlier one."""
-        latency = self._random.randint(*self.config.latency_us) * 1000
-        self._pending.append((max(at_ns + latency, self._pending[-1][0] if self._pending else 0), command, payload))
+        latency_ns = self._random.randint(*self.config.latency_us) * 1000
+        self._agenda.queue(at_ns + latency_ns, partial(self._execute, command, payload))
 
     def _serial_error(self, error: TicError, at_ns: int) -> None:
         self._queue(NOT_A_COMMAND, int(error).to_bytes(4, "little"), at_ns)
@@ -235,26 +213,24 @@ class TicBoard:
             self._restart_timeout(at_ns)
         if command == NOT_A_COMMAND:
             self._occurred |= TicError(int.from_bytes(payload, "little"))
-            self._raise_errors(TicError.SERIAL)
+            self._raise_errors(TicError.SERIAL, at_ns)
         elif command in BLOCK:
             self._answer(command, payload, at_ns)
         elif command in LONG:
             self._execute_long(command, decode_long(payload), at_ns)
         elif command in SEVEN_BIT:
-            self._execute_seven_bit(command, payload[0])
+            self._execute_seven_bit(command, payload[0], at_ns)
         else:
             self._execute_quick(command, at_ns)
 
     def _execute_long(self, command: int, value: int, at_ns: int) -> None:
         if command == 0xE0:
-            self._homing = _Homing.NO
             self._aim(_Plan.POSITION, value, at_ns)
         elif command == 0xE3:
-            self._homing = _Homing.NO
             self._aim(_Plan.VELOCITY, value, at_ns)
         elif command == 0xEC:
             self._halt(at_ns)
-            self._offset = value - round(self._rest_pulses())
+            self._axis.set_count(at_ns, value)
             self._uncertain = False
         elif command == 0xE5:
             self._starting_speed = value & 0xFFFF_FFFF
@@ -267,9 +243,9 @@ class TicBoard:
         else:
             self._max_acceleration = max(value & 0xFFFF_FFFF, 100)
 
-    def _execute_seven_bit(self, command: int, value: int) -> None:
+    def _execute_seven_bit(self, command: int, value: int, at_ns: int) -> None:
         if command == 0x97:
-            self._go_home(forward=bool(value))
+            self._go_home(at_ns, forward=bool(value))
         else:
             self._seven_bit[command] = value
 
@@ -289,7 +265,7 @@ class TicBoard:
             self._halt(at_ns)
             self._uncertain = True
         elif command == 0x8F:
-            self._raise_errors(TicError.SAFE_START)
+            self._raise_errors(TicError.SAFE_START, at_ns)
         elif command == 0xB0:
             # "Reset" reloads the settings and halts; the position stays, uncertain
             self._halt(at_ns)
@@ -305,90 +281,53 @@ class TicBoard:
             return
         self._plan, self._target = plan, target
         self._input = _Input.POSITION if plan is _Plan.POSITION else _Input.VELOCITY
-        speed = self._max_speed / SPEED_UNIT
+        speed, a = self._max_speed / SPEED_UNIT, self._acceleration_sps2()
         if plan is _Plan.POSITION:
-            self.lens.move_to(at_ns, target - self._offset, speed, self._acceleration_sps2())
+            self._axis.move_to(at_ns, target, speed, a)
         else:
-            velocity = min(max(target / SPEED_UNIT, -speed), speed)
-            self._ramp(velocity, at_ns)
-        self._watch_switches(at_ns)
-
-    def _ramp(self, velocity_sps: float, at_ns: int) -> None:
-        now_sps, a = self.lens.velocity_at(at_ns), self._acceleration_sps2()
-        if velocity_sps == 0.0 and now_sps != 0.0:
-            # a controller counts whole steps, and rests on one
-            end = self.lens.pulses_at(at_ns) + now_sps * abs(now_sps) / (2 * a)
-            rest = math.ceil(end - 1e-6) if now_sps > 0.0 else math.floor(end + 1e-6)
-            self.lens.move_to(at_ns, rest, abs(now_sps), a)
-        else:
-            self.lens.set_velocity(at_ns, velocity_sps, a)
-        self._watch_switches(at_ns)
+            self._axis.ramp(at_ns, min(max(target / SPEED_UNIT, -speed), speed), a)
+        self._watch_switches()
 
     def _halt(self, at_ns: int) -> None:
-        self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
-        self.lens.halt(at_ns)
-        self._switch_ns = None
+        self._plan, self._input = _Plan.OFF, _Input.HALT
+        self._axis.halt(at_ns)
+        self._watch_switches()
 
-    def _raise_errors(self, errors: TicError) -> None:
+    def _raise_errors(self, errors: TicError, at_ns: int) -> None:
         """Note errors and give the soft response: decelerate to hold. Any error violates safe start, too."""
         self._errors |= errors | TicError.SAFE_START
         self._occurred |= errors
-        self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
-        self._ramp(0.0, self._now_ns)
+        self._plan, self._input = _Plan.OFF, _Input.HALT
+        self._axis.ramp(at_ns, 0.0, self._acceleration_sps2())
+        self._watch_switches()
 
     def _acceleration_sps2(self) -> float:
         return self._max_acceleration * 1.0 / ACCELERATION_UNIT
 
-    def _rest_pulses(self) -> float:
-        rest_ns = self.lens.rest_from_ns()
-        return self.lens.pulses_at(max(rest_ns or self._now_ns, self._now_ns))
-
     # --- limit switches and homing ---------------------------------------------------------------------------------
 
-    def _watch_switches(self, from_ns: int) -> None:
-        """Find out when the planned path runs into a switch (or off it, while homing)."""
-        self._switch_ns = None
-        if not self.config.limit_switches:
-            return
-        low, high = -1.0, self.lens.travel_steps + 1.0
-        if self._homing is _Homing.AWAY:
-            edge = -0.5 if not self._home_forward else self.lens.travel_steps + 0.5
-            self._switch_ns = self.lens.reaches(edge, from_ns, upwards=not self._home_forward)
-            return
-        moving_up = self._heading() > 0
-        self._switch_ns = self.lens.reaches(high if moving_up else low, from_ns, upwards=moving_up)
-
-    def _heading(self) -> float:
-        """Return the direction in which the path ends: switches only stop motion towards them."""
-        if self._homing is not _Homing.NO:
-            return (1.0 if self._home_forward else -1.0) * (1.0 if self._homing is _Homing.TOWARDS else -1.0)
-        if self._plan is _Plan.VELOCITY:
-            return float(self._target)
-        if self._plan is _Plan.POSITION:
-            return self._target - self._offset - self.lens.pulses_at(self._now_ns)
-        return self.lens.velocity_at(self._now_ns)
+    def _watch_switches(self) -> None:
+        self._agenda.put("switch", self._axis.switch_ns, self._switch)
 
     def _switch(self, at_ns: int) -> None:
-        self._switch_ns = None
-        if self._homing is _Homing.TOWARDS:
-            self.lens.halt(at_ns)
-            self._homing = _Homing.AWAY
-            away = self.config.homing_speed_away / SPEED_UNIT
-            self._ramp(-away if self._home_forward else away, at_ns)
-        elif self._homing is _Homing.AWAY:
-            self._halt(at_ns)
-            self._offset = -round(self._rest_pulses())
-            self._uncertain = False
-        elif self.lens.velocity_at(at_ns) != 0.0:
-            self._halt(at_ns)
-            self._uncertain = True
+        happened = self._axis.happen(at_ns)
+        if happened in {Happened.HOMED, Happened.LIMIT}:
+            self._plan, self._input = _Plan.OFF, _Input.HALT
+            self._uncertain = happened is Happened.LIMIT
+        self._watch_switches()
 
-    def _go_home(self, *, forward: bool) -> None:
+    def _go_home(self, at_ns: int, *, forward: bool) -> None:
         if self._errors or not self.config.limit_switches:
             return
-        self._plan, self._home_forward, self._homing = _Plan.OFF, forward, _Homing.TOWARDS
-        towards = self.config.homing_speed_towards / SPEED_UNIT
-        self._ramp(towards if forward else -towards, self._now_ns)
+        self._plan = _Plan.OFF
+        self._axis.home(
+            at_ns,
+            upwards=forward,
+            towards_sps=self.config.homing_speed_towards / SPEED_UNIT,
+            away_sps=self.config.homing_speed_away / SPEED_UNIT,
+            acceleration_sps2=self._acceleration_sps2(),
+        )
+        self._watch_switches()
 
     # --- state -----------------------------------------------------------------------------------------------------
 
@@ -397,11 +336,9 @@ class TicBoard:
         self._errors = TicError.SAFE_START
         self._occurred = TicError(0)
         self._uncertain = not referenced
-        self._plan, self._input, self._homing = _Plan.OFF, _Input.HALT, _Homing.NO
-        self._target, self._home_forward = 0, False
-        pulses = self.lens.pulses_at(at_ns)
-        self._offset = round(self.lens.rotor_at(at_ns) - pulses) if referenced else -round(pulses)
-        self._switch_ns = self._timeout_ns = None
+        self._plan, self._input, self._target = _Plan.OFF, _Input.HALT, 0
+        self._axis.power_up(at_ns, referenced=referenced)
+        self._watch_switches()
         self._load_settings()
         self._restart_timeout(at_ns)
 
@@ -413,7 +350,8 @@ class TicBoard:
 
     def _restart_timeout(self, at_ns: int) -> None:
         timeout_ms = self.config.command_timeout_ms
-        self._timeout_ns = at_ns + timeout_ms * NS_PER_MS if timeout_ms else None
+        due_ns = at_ns + timeout_ms * NS_PER_MS if timeout_ms else None
+        self._agenda.put("timeout", due_ns, partial(self._raise_errors, TicError.COMMAND_TIMEOUT))
 
     def _answer(self, command: int, payload: bytes, at_ns: int) -> None:
         offset, length = payload[0] | (payload[1] & 0x40) << 1, payload[1] & 0x3F
@@ -430,15 +368,14 @@ class TicBoard:
 
     def _variables(self, at_ns: int) -> bytearray:
         """Return the 256 bytes that "get variable" reads from."""
-        pulses, velocity = self.lens.pulses_at(at_ns), self.lens.velocity_at(at_ns)
-        position = _count(pulses, velocity) + self._offset
-        rotor = self.lens.rotor_at(at_ns)
+        position, velocity = self._axis.count_at(at_ns), self._axis.velocity_at(at_ns)
+        low, high = self._axis.at_switches(at_ns)
         flags = (
             (TicError.DEENERGIZED not in self._errors)
             | self._uncertain << 1
-            | (rotor > self.lens.travel_steps + 0.5) << 2
-            | (rotor < -0.5) << 3
-            | (self._homing is not _Homing.NO) << 4
+            | high << 2
+            | low << 3
+            | (self._axis.search is not Search.NO) << 4
         )
         state = _Operation.NORMAL
         if self._errors:
@@ -476,7 +413,7 @@ class TicBoard:
         velocity = self.lens.velocity_at(at_ns)
         if velocity:
             pulses = self.lens.pulses_at(at_ns)
-            return round(abs(pulses - _count(pulses, velocity)) / abs(velocity) * NS_PER_S)
+            return round(abs(pulses - last_step(pulses, velocity)) / abs(velocity) * NS_PER_S)
         return max(0, at_ns - max(self.lens.rest_from_ns() or 0, self._begin_ns))
 
     def _settings(self) -> bytearray:
@@ -500,22 +437,5 @@ class TicBoard:
         return table.data
 
 
-def _count(pulses: float, velocity_sps: float) -> int:
-    """Return the last step that was made: the whole number just behind a moving motor."""
-    if velocity_sps > 0.0:
-        return int((pulses + 1e-6) // 1)
-    if velocity_sps < 0.0:
-        return -int((-pulses + 1e-6) // 1)
-    return round(pulses)
-
-
-class _Board:
-    """The entry point ``elpd.boards: tic``."""
-
-    def serve(self, settings: Mapping[str, Any]) -> RunningBoard:
-        """Serve a Tic in front of a lens; see ``boards.settings`` for the keys."""
-        lens, config, seed = lens_and_config(settings, TicConfig)
-        return PtyServer(TicBoard(lens, config, seed=seed, begin_ns=time.monotonic_ns()))
-
-
-BOARD = _Board()
+BOARD = ServedBoard(TicBoard, TicConfig)
+"""The entry point ``elpd.boards: tic``."""
