@@ -62,6 +62,33 @@ def adaptive_filter(raw: Sequence[float]) -> list[float]:
     return out
 
 
+def leak_steps(
+    events: Sequence[tuple[int, int, int, int]],
+    decay_per_us: float,
+    off_step: float,
+    shape: tuple[int, int],
+    until_us: int,
+) -> NDArray[np.float64]:
+    """Leaky integration, read as the sum it is: every event's step, faded since it happened."""
+    level = np.zeros(shape)
+    for t_us, x, y, on in events:
+        level[y, x] += (1.0 if on else -off_step) * math.exp(-decay_per_us * (until_us - t_us))
+    return level
+
+
+def voxel_grid(
+    events: Sequence[tuple[int, int, int, int]], shape: tuple[int, int], bins: int = 5
+) -> NDArray[np.float64]:
+    """A hat function over each bin, one event at a time."""
+    grid = np.zeros((bins, *shape))
+    begin, span = events[0][0], max(events[-1][0] - events[0][0], 1)
+    for t_us, x, y, on in events:
+        place = (bins - 1) * (t_us - begin) / span
+        for one in range(bins):
+            grid[one, y, x] += (1.0 if on else -1.0) * max(0.0, 1.0 - abs(place - one))
+    return grid
+
+
 def fold_spectrum(
     nodes: Sequence[NDArray[np.complex128]], weights: Sequence[float], shift_cells: tuple[float, float]
 ) -> NDArray[np.complex128]:

@@ -1,11 +1,14 @@
 """Focus the simulated rig many times and say how it went, so that every figure of the README can be made again.
 
-    python tools/acceptance.py [--seeds 30] [--board tic] [--camera evk4] [--motion static] [--set KEY=VALUE] [--json]
+    python tools/acceptance.py [--seeds 30] [--board tic] [--camera evk4] [--motion static] [--set KEY=VALUE]
+                               [--json [FILE]]
 
-Each seed is a scene, a place of focus on the lens's travel and a set of sensor imperfections; each is focused from both
-sides. Three errors are told apart: of the estimate (where the cycle says focus was), of the stop (where the motor came
-to rest after the crossing was certain) and of the end (where the glass rests when the cycle is over, the one that
-counts). ``false`` counts cycles that ended FOCUSED outside one depth of focus: there should be none, ever.
+Each seed is a scene, a place of focus on the lens's travel and a set of sensor imperfections; each is focused from
+both sides. Three errors are told apart: of the estimate (where the cycle says focus was), of the stop (where the motor
+came to rest after the crossing was certain) and of the end (where the glass rests when the cycle is over, the one that
+counts). ``--json`` prints one object per cycle; ``--json FILE`` prints the table and leaves settings and cycles in a
+file, which ``tools/benchmark.py --acceptance FILE`` holds against the goals. ``false`` counts cycles that ended
+FOCUSED outside one depth of focus: there should be none, ever.
 """
 
 from __future__ import annotations
@@ -16,10 +19,13 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import fields
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from elpd_drivers.sim.rig import SimSettings
 
 from elpd import rig
 from elpd.config import Config, load
@@ -41,7 +47,9 @@ def main() -> int:
     parser.add_argument("--start-um", type=float, nargs="+", default=[-200.0, 200.0], help="starts beside true focus")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="any configuration key")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--json", action="store_true", help="one JSON object per cycle, and no table")
+    parser.add_argument(
+        "--json", nargs="?", const="-", metavar="FILE", help="one JSON object per cycle and no table, or all in FILE"
+    )
     chosen = parser.parse_args()
     table = [f"sim.{key}={getattr(chosen, key)}" for key in ("board", "camera", "motion")]
     config = load(overrides=[*table, *chosen.set, "journal.enabled=false"])
@@ -50,9 +58,12 @@ def main() -> int:
     with ProcessPoolExecutor(chosen.jobs) as pool:
         for row in pool.map(partial(focus, config), cases):
             rows.append(row)
-            print(json.dumps(row) if chosen.json else line(row), flush=True)
-    if not chosen.json:
+            print(json.dumps(row) if chosen.json == "-" else line(row), flush=True)
+    if chosen.json != "-":
         print(summary(rows, config.sim.depth_of_focus_um))
+    if chosen.json not in (None, "-"):
+        kept = {"settings": all_settings(config), "rows": rows}
+        Path(chosen.json).write_text(json.dumps(kept), encoding="utf-8")
     return int(any(is_false(row, config.sim.depth_of_focus_um) for row in rows))
 
 
@@ -89,8 +100,35 @@ def focus(config: Config, case: tuple[int, float]) -> dict[str, Any]:
         rig.release(parts)
     turned = [one for one in sweeps.ended if one["end"] == "behind"]
     row["reversal_travel_um"] = [abs(one["ended_um"] - one["begun_um"]) for one in turned]
+    row["first_direction_wrong"] = first_direction_wrong(sweeps.ended, row.get("true_focus_um"))
+    row["stopped_early"] = stopped_early(sweeps.ended, row.get("true_focus_um"), config.sim.depth_of_focus_um)
     row["cpu_s"] = time.process_time() - begun
     return row
+
+
+def all_settings(config: Config) -> dict[str, Any]:
+    """Return the simulated rig's settings, those that were left at their defaults too."""
+    drawn = {"seed", "start_um"}
+    defaults = {one.name: one.default for one in fields(SimSettings) if one.name not in drawn}
+    return defaults | config.sim.model_dump(mode="json", exclude=drawn)
+
+
+def first_direction_wrong(ended: list[dict[str, Any]], true_focus_um: float | None) -> bool | None:
+    """Say whether the first verdict was wrong: turned from focus, or took it for passed on the way from it."""
+    if not ended or true_focus_um is None:
+        return None
+    first = ended[0]
+    ahead = (true_focus_um - first["begun_um"]) * (first["ended_um"] - first["begun_um"]) > 0.0
+    return bool(first["end"] == ("behind" if ahead else "passed"))
+
+
+def stopped_early(ended: list[dict[str, Any]], true_focus_um: float | None, depth_of_focus_um: float) -> bool:
+    """Say whether a sweep took focus for passed more than a depth of focus before it was."""
+    if true_focus_um is None:
+        return False
+    return any(
+        one["end"] == "passed" and one["sign"] * (true_focus_um - one["ended_um"]) > depth_of_focus_um for one in ended
+    )
 
 
 def is_false(row: dict[str, Any], depth_of_focus_um: float) -> bool:

@@ -72,8 +72,9 @@ SYN_1FPS = replace(SYN, span=5.0, below=-2.0, overwrite="no", skip_us=100_000, l
 """The release's "1 fps": one frame, taken at 350 ms, serves the bins from 100 ms on: a frame from the future."""
 
 SYN_NO_FILTER = replace(SYN, filtered=False)
-SYN_NO_LAPLACIAN = replace(SYN, laplacian=False, span=0.6, below=-0.5, skip_us=25_000)
-"""The thresholds and the late start of the release's DAVIS ablation; it has none for the synthetic set."""
+SYN_NO_LAPLACIAN = replace(SYN, laplacian=False, span=0.6, below=-0.5, skip_us=25_000, overwrite="no")
+"""Thresholds, late start and end at the first trigger of the release's DAVIS ablation; it has none for the synthetic
+set, whose rule "until the frame's interval ends" has no meaning without frames."""
 
 
 def published(constants: Published) -> Peer:

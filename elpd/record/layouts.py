@@ -67,7 +67,8 @@ class RecordedSweep:
     """A sweep on disk: events in time order, frames, and the region its makers chose.
 
     ``t_us`` ``int64``, ``x`` and ``y`` ``uint16``, ``on`` ``uint8`` (1 brighter, 0 darker), all of one length.
-    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it.
+    ``bin_us`` is the bin that the authors chose for this scene; only their own method uses it. ``frame_age_us`` is how
+    long before a frame was there the middle of its exposure lay, where frames are stamped with when they were there.
     """
 
     t_us: NDArray[np.int64]
@@ -79,6 +80,7 @@ class RecordedSweep:
     frames: tuple[FrameFile, ...] = ()
     bin_us: int | None = None
     warnings: tuple[str, ...] = field(default=())
+    frame_age_us: int = 0
 
 
 def read_sweep(path: Path, *, frames: str | None = None, size: Geometry | None = None) -> RecordedSweep:

@@ -181,7 +181,8 @@ class SweepSearch:
             self._meter.set_reference(reference)
         if t_us < self._begin_us:
             return None
-        self._frames.add(t_us, self._ruler.position(t_us), self._frame_energy.measure(pixels))
+        exposed = self._ruler.position(t_us - self._sweep.frame_age_us)
+        self._frames.add(t_us, exposed, self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 

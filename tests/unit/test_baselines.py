@@ -32,6 +32,13 @@ def sky() -> FocusStack:
 
 
 @pytest.fixture(scope="module")
+def contrasty() -> FocusStack:
+    """Squares of four pixels, seventeen times brighter than what is between them."""
+    bright = np.random.default_rng(4).random((12, 12)) >= 0.5
+    return little_stack(np.kron(np.where(bright, 2.6, 0.15), np.ones((4, 4))))
+
+
+@pytest.fixture(scope="module")
 def flowing() -> FocusStack:
     """A scene that drifts at 40 px/s behind a high threshold: flow makes the events, and a sharp picture makes most."""
     return little_stack(texture(3), move=lambda t_us: 4e-5 * t_us * 5.0, threshold=0.25)
@@ -96,6 +103,19 @@ def test_published_elp_finds_the_sign_change_and_says_when_it_could_know(still: 
     # The release answers three bins and five milliseconds before the transition it saw; the decision came after it.
     assert answer.focus_us == answer.details["transition_us"] - 2_000 - 2 * 2_000 - 5_000
     assert answer.details["trigger_us"] > answer.details["transition_us"]
+
+
+@pytest.mark.parametrize("name", ["elp-syn", "elp-syn-1fps", "elp-davis", "elp-evk4", "elp-no-filter"])
+def test_published_elp_works_with_its_own_constants_where_contrast_is_high(name: str, contrasty: FocusStack) -> None:
+    """Each data set's thresholds, as released, on a scene whose grey levels reach them."""
+    answer = PEERS[name].run(contrasty)
+    assert abs(answer.focus_us - FOCUS_US) < 12_000
+    assert answer.details["trigger_us"] > FOCUS_US
+
+
+def test_without_a_laplacian_elp_works_where_all_that_is_sharp_is_bright(sky: FocusStack) -> None:
+    answer = PEERS["elp-no-laplacian"].run(sky)
+    assert abs(answer.focus_us - FOCUS_US) < 12_000
 
 
 # --- where they are documented to fail ---------------------------------------------------------------------------

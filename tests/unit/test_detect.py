@@ -108,6 +108,19 @@ def test_frames_are_the_best_witness() -> None:
     assert found.focus.contributions[0][0] == "frames"
 
 
+def test_a_frame_that_comes_late_is_placed_where_it_was_exposed() -> None:
+    world = sweep(seed=7, size=SIZE, end_um=110.0, frame_every_us=2_000)
+    prompt = recorded(world)
+    late = replace(prompt, frames=tuple(Stored(one.t_us + 9_000, one.pixels) for one in prompt.frames))
+    aware = replace(late, frame_age_us=9_000)
+    errors = []
+    for record in (late, aware):
+        found = SweepSearch(record, ROI, Ruler.of_speed(SPEED_UM_S), depth_of_focus_um=DOF_UM, begin_us=0).run()
+        assert found.focus.contributions[0][0] == "frames"
+        errors.append(found.focus.contributions[0][1])
+    assert errors[0] - errors[1] == pytest.approx(9e-3 * SPEED_UM_S, abs=0.5)
+
+
 def test_a_first_frame_without_structure_is_not_the_end() -> None:
     world = sweep(seed=7, size=SIZE, end_um=90.0, frame_every_us=2_000)
     dark = replace(world, frames=[(world.frames[0][0], np.zeros_like(world.frames[0][1])), *world.frames[1:]])

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.limit import SignLimit
 from benchmarks.optics import FocusRenderer, load_psf
 from benchmarks.retina import Retina, RetinaEvents, joined
 from benchmarks.scenes import load_picture
 from benchmarks.sets import APERTURE_US, FRAME_PERIODS_US, SETS, CaseSet
 from benchmarks.shake import MOTIONS, shifts_px
+from benchmarks.shutter import Shutter
 from elpd.baselines import FocusStack, LensPath, StackFrame
 from elpd.baselines.contrast import tenengrad
 from elpd.baselines.rates import vertex
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 LAMP_HZ = 100.0
 """A lamp on 50 Hz mains."""
 
-GENERATION = 4
+GENERATION = 5
 """Raised whenever the same name and seed would give other events, so that stale files are not used."""
 
 
@@ -52,6 +54,10 @@ class Case:
         """The name in tables, files and ``--cases`` patterns."""
         return f"{self.set_name}-{self.scene}-fov{self.fov}-{self.motion}"
 
+    def matches(self, pattern: str) -> bool:
+        """Say whether the name is one of *pattern*'s."""
+        return fnmatchcase(self.name, pattern)
+
     @property
     def of_set(self) -> CaseSet:
         """The set it belongs to."""
@@ -60,11 +66,12 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class SweepRecording:
-    """A sweep and its truth, the time in focus. Frames (n, size, size) ``uint8`` were taken at ``frame_t_us`` (n,).
+    """A sweep and its truth, the time in focus. Frames (n, size, size) ``uint8`` are there from ``frame_t_us`` (n,) on.
 
     ``sharpest_um`` is where the noise-free picture of this scene has its highest contrast. Off the axis that is not
     where the PSF has its least RMS radius, which is what the paper and the tables call truth: the difference is a limit
-    to what any method that looks at pictures can reach.
+    to what any method that looks at pictures can reach. ``sign_limit_um`` is the statistical limit (``limit``), ``nan``
+    where it is not defined.
     """
 
     case: Case
@@ -76,6 +83,7 @@ class SweepRecording:
     frames: NDArray[np.uint8]
     sharpest_um: float
     truth_us: float
+    sign_limit_um: float
 
     @property
     def geometry(self) -> Geometry:
@@ -88,18 +96,20 @@ class SweepRecording:
         return region(self.case.of_set)
 
     def frames_at(self, rate: str) -> tuple[StackFrame, ...]:
-        """Return the frames of a camera that delivers *rate* of them per second."""
+        """Return the frames of a camera that delivers *rate* of them per second, stamped amid their exposures."""
         wanted_us = np.arange(0, self.case.of_set.end_us + 1, FRAME_PERIODS_US[rate])
         if rate == "1":
             wanted_us = wanted_us[:1]
         # Recorded frames keep their own times, about as far apart as the rate says.
         nearest = np.unique(np.argmin(np.abs(self.frame_t_us[None, :] - wanted_us[:, None]), axis=1))
-        return tuple(StackFrame(int(self.frame_t_us[k]), self.frames[k]) for k in nearest)
+        return tuple(self._frame(k) for k in nearest)
 
     def frame_nearest(self, t_us: float) -> StackFrame:
         """Return the kept frame nearest to *t_us*."""
-        k = int(np.argmin(np.abs(self.frame_t_us - t_us)))
-        return StackFrame(int(self.frame_t_us[k]), self.frames[k])
+        return self._frame(int(np.argmin(np.abs(self.frame_t_us - self.case.of_set.frame_age_us - t_us))))
+
+    def _frame(self, k: int) -> StackFrame:
+        return StackFrame(int(self.frame_t_us[k]) - self.case.of_set.frame_age_us, self.frames[k])
 
     def path(self) -> LensPath:
         """Return where the lens was."""
@@ -140,7 +150,7 @@ def cases_of(set_name: str, seed: int, pattern: str = "*") -> list[Case]:
         for field in chosen.fields
         for motion in chosen.motions
     )
-    return [case for case in every if fnmatchcase(case.name, pattern)]
+    return [case for case in every if case.matches(pattern)]
 
 
 def make(case: Case) -> SweepRecording:
@@ -153,17 +163,28 @@ def make(case: Case) -> SweepRecording:
     renderer = FocusRenderer(load_picture(case.scene, side), load_psf(case.fov), chosen.margin_px)
     times_us = range(0, chosen.end_us + 1, chosen.step_us)
     moved = chosen.motion_px * shifts_px(MOTIONS[case.motion], len(times_us), chosen.step_us / 1e3, motion_rng)
+
+    def picture_at(t_us: int) -> NDArray[np.float32]:
+        # The area opens evenly, so the diameter, and with it the blur of a given defocus, with the square root.
+        position_um = np.sqrt(_opened(chosen, t_us)) * chosen.defocus_per_um * chosen.position_um(t_us)
+        # Before time zero, which only the first exposure sees, the scene moved as it will after it.
+        shift = np.sign(t_us) * moved[abs(t_us) // chosen.step_us]
+        lamp = np.float32(1.0 + chosen.flicker * np.sin(2.0 * np.pi * LAMP_HZ * t_us / 1e6))
+        seen = lamp * renderer.frame(position_um, (float(shift[0]), float(shift[1])))
+        return np.asarray(np.clip(seen, 0.0, 255.0), dtype=np.float32)
+
+    shutter = Shutter(chosen.exposure_us, chosen.read_out_us, chosen.step_us)
+    for t_us in range(-shutter.reach_us, 0, chosen.step_us):
+        shutter.see(picture_at(t_us))
+    limit = SignLimit(region(chosen))
     aperture: Retina | None = None
     retina: Retina | None = None
     kept_t_us, kept, edges = [], [], []
-    for t_us, shift in zip(times_us, moved, strict=True):
-        opened = min(t_us / APERTURE_US, 1.0) if chosen.expose is not None else 1.0
-        # The area opens evenly, so the diameter, and with it the blur of a given defocus, with the square root.
-        position_um = np.sqrt(opened) * chosen.defocus_per_um * chosen.position_um(t_us)
-        lamp = np.float32(1.0 + chosen.flicker * np.sin(2.0 * np.pi * LAMP_HZ * t_us / 1e6))
-        image = np.clip(lamp * renderer.frame(position_um, (float(shift[0]), float(shift[1]))), 0.0, 255.0)
+    for t_us in times_us:
+        image = picture_at(t_us)
+        shutter.see(image)
         if chosen.expose is not None and t_us <= APERTURE_US:
-            dimmed = image * np.float32(opened)
+            dimmed = image * np.float32(_opened(chosen, t_us))
             if aperture is None:
                 aperture = Retina(chosen.expose, dimmed, 0, APERTURE_US, retina_rng)
             else:
@@ -174,10 +195,12 @@ def make(case: Case) -> SweepRecording:
             retina = Retina(chosen.retina, image, t_us, chosen.end_us, retina_rng)
         else:
             retina.see(image, float(t_us))
+            limit.add(retina.newest(), image, chosen.position_um(t_us - 0.5 * chosen.step_us))
         if t_us % chosen.keep_every_us == 0:
             kept_t_us.append(t_us)
             edges.append(tenengrad(image, region(chosen)))
-            noisy = image + chosen.frame_noise_dn * frame_rng.standard_normal(image.shape)
+            exposed = shutter.exposed()
+            noisy = exposed + chosen.frame_noise_dn * frame_rng.standard_normal(exposed.shape)
             kept.append(np.round(np.clip(noisy, 0.0, 255.0)).astype(np.uint8))
     assert retina is not None
     parts: list[RetinaEvents] = [one.events() for one in (aperture, retina) if one is not None]
@@ -194,7 +217,13 @@ def make(case: Case) -> SweepRecording:
         frames=np.stack(kept),
         sharpest_um=chosen.position_um(sharpest_us),
         truth_us=chosen.truth_us,
+        sign_limit_um=limit.sigma_um(chosen.depth_of_focus_um),
     )
+
+
+def _opened(chosen: CaseSet, t_us: float) -> float:
+    """Return the share of the aperture's area that is open."""
+    return 1.0 if chosen.expose is None else min(t_us / APERTURE_US, 1.0)
 
 
 def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
@@ -211,6 +240,7 @@ def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
                 **columns,
                 sharpest_um=float(kept["sharpest_um"]),
                 truth_us=case.of_set.truth_us,
+                sign_limit_um=float(kept["sign_limit_um"]),
             )
     made = make(case)
     cache.mkdir(parents=True, exist_ok=True)
@@ -225,6 +255,7 @@ def load_or_make(case: Case, cache: Path | None) -> SweepRecording:
         frame_t_us=made.frame_t_us,
         frames=made.frames,
         sharpest_um=made.sharpest_um,
+        sign_limit_um=made.sign_limit_um,
     )
     aside.replace(path)
     return made

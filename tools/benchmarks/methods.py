@@ -15,29 +15,34 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.sets import APERTURE_US, MAP
-from elpd.baselines import PEERS, StackFrame
+from benchmarks.sets import APERTURE_US, E2VID, MAP, REBUILT
+from elpd.baselines import PEERS, StackFrame, e2vid, reconstruction
 from elpd.record.layouts import RecordedSweep
 from elpd.record.sweep_file import SweepSearch
 from elpd.records import Outcome
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.pictures import display
-from elpd.vision.reference import reference_from_temporal_image
+from elpd.vision.reference import reference_from_frame, reference_from_temporal_image
 from elpd.vision.ruler import Ruler
 from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from benchmarks.cases import SweepRecording
     from elpd.records import TemporalImage
+    from elpd.vision.reference import Reference
 
 OURS = "elpd"
 NO_FRAMES = "-"
 """The frame rate of a method that sees events only."""
 _AHEAD = 0.35
 """Where in the sweep the released "1 fps" program takes its one frame: a frame from the future."""
+REBUILT_SHARE = 0.1
+"""How much of the sweep goes by before a picture made from its own events is used."""
 _CURVES_OF = (("elp-syn", "50"), ("elp-syn-1fps", "1"))
 """Only these curves are kept; the report draws some of them, and all would make the results ten times larger."""
 
@@ -57,11 +62,13 @@ class Row:
     """One method on one case. ``None`` where there is no answer.
 
     ``error_um`` is estimate less truth, ``sharpest_um`` where the picture itself is sharpest, on the same ruler,
-    ``decided_um`` how far past focus the lens was when the answer could be given, ``focusing_ms`` the time from the
-    start of the sweep until the lens could be back at the estimate, without braking.
+    ``limit_um`` how well the signs of its events could tell focus at best (``limit``), ``decided_um`` how far past
+    focus the lens was when the answer could be given, ``focusing_ms`` the time from the start of the sweep until the
+    lens could be back at the estimate, without braking.
     """
 
     case: str
+    seed: int
     set_name: str
     scene: str
     fov: int
@@ -74,6 +81,7 @@ class Row:
     decided_um: float | None
     focusing_ms: float | None
     sharpest_um: float
+    limit_um: float | None
     cpu_ms: float
     reason: str
     details: dict[str, Any] = field(default_factory=dict)
@@ -85,7 +93,7 @@ class Row:
 
 def all_methods() -> dict[str, Method]:
     """Return every method by name, ours first."""
-    methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, NO_FRAMES))}
+    methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, REBUILT, E2VID, NO_FRAMES))}
     for name, peer in PEERS.items():
         if not peer.needs_frames:
             rates: tuple[str, ...] = (NO_FRAMES,)
@@ -93,21 +101,27 @@ def all_methods() -> dict[str, Method]:
             rates = ("1",)
         else:
             # One frame has no contrast to compare with, and the released programs at 1 fps are the method above.
-            rates = ("50", "20", MAP) if name == "elp-evk4" else ("50", "20")
+            rates = ("50", "20", MAP, REBUILT, E2VID) if name == "elp-evk4" else ("50", "20")
         methods[name] = Method(name, peer.title, peer.sees, rates)
     return methods
 
 
-def run_method(method: Method, rate: str, recording: SweepRecording) -> Row:
-    """Run *method* on *recording* with frames at *rate*."""
-    picture = aperture_picture(recording) if rate == MAP else None
-    if picture is not None:
-        grey = display(picture.log_intensity, picture.valid)
-        frames: tuple[StackFrame, ...] = (StackFrame(recording.case.of_set.sweep_begin_us, grey),)
+def run_method(method: Method, rate: str, recording: SweepRecording, weights: Path | None = None) -> Row:
+    """Run *method* on *recording* with frames at *rate*, or with the picture that it names; *weights* are E2VID's."""
+    begin_us = recording.case.of_set.sweep_begin_us
+    picture: _Start | None = None
+    if rate in (MAP, REBUILT, E2VID):
+        picture = _start(rate, recording, weights)
+        if picture is None:
+            return _no_picture(method.name, rate, recording)
+        begin_us = picture.begin_us
+        frames: tuple[StackFrame, ...] = (StackFrame(begin_us, picture.grey),)
     else:
         frames = () if rate == NO_FRAMES else recording.frames_at(rate)
     if method.name == OURS:
-        return _run_ours(recording, rate, () if picture is not None else frames, picture)
+        if picture is not None:
+            return _run_ours(recording, rate, (), begin_us, picture.reference)
+        return _run_ours(recording, rate, frames, begin_us, None)
     if method.name == "elp-syn-1fps":
         chosen = recording.case.of_set
         ahead_us = chosen.sweep_begin_us + _AHEAD * (chosen.end_us - chosen.sweep_begin_us)
@@ -152,10 +166,53 @@ def aperture_picture(recording: SweepRecording) -> TemporalImage:
     return temporal_image(first.believed(), read_transmittance("linear"), SensorUs(0))
 
 
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """A picture that is there before the search begins: for our detector, as grey for the others, and from when on."""
+
+    reference: Reference
+    grey: NDArray[np.uint8]
+    begin_us: int
+
+
+def _start(rate: str, recording: SweepRecording, weights: Path | None) -> _Start | None:
+    """Return the picture named by *rate*; ``None`` where no event came to make one of."""
+    begin_us, end_us = recording.case.of_set.sweep_begin_us, recording.case.of_set.end_us
+    if rate == MAP:
+        made = aperture_picture(recording)
+        grey = display(made.log_intensity, made.valid)
+        return _Start(reference_from_temporal_image(made, recording.roi), grey, begin_us)
+    # In place of the aperture's: what the first tenth of the sweep itself lets one guess.
+    until_us = begin_us + round(REBUILT_SHARE * (end_us - begin_us))
+    first, stop = (int(place) for place in np.searchsorted(recording.t_us, (begin_us, until_us)))
+    if stop == first:
+        return None
+    events = tuple(column[first:stop] for column in (recording.t_us, recording.x, recording.y, recording.on))
+    if rate == REBUILT:
+        log = reconstruction.reconstruct(*events, recording.geometry, until_us)
+        return _Start(reference_from_frame(np.exp(log), recording.roi), display(log), until_us)
+    if weights is None:
+        raise ValueError("E2VID needs a file of weights")
+    seen = e2vid.reconstruct(e2vid.E2vid(weights), *events, recording.geometry)
+    if seen is None:
+        return None
+    return _Start(reference_from_frame(seen, recording.roi), display(seen), until_us)
+
+
+def _no_picture(name: str, rate: str, recording: SweepRecording) -> Row:
+    nothing = {"focus_us": math.nan, "sigma_us": math.nan, "decided_us": math.nan, "cpu_ms": 0.0}
+    return _row(recording, name, rate, **nothing, reason="no event to make a picture of", details={})
+
+
 def _run_ours(
-    recording: SweepRecording, rate: str, frames: tuple[StackFrame, ...], picture: TemporalImage | None
+    recording: SweepRecording,
+    rate: str,
+    frames: tuple[StackFrame, ...],
+    begin_us: int,
+    reference: Reference | None,
 ) -> Row:
-    held = tuple(_HeldFrame(frame.t_us, frame.pixels) for frame in frames)
+    age_us = recording.case.of_set.frame_age_us
+    held = tuple(_HeldFrame(frame.t_us + age_us, frame.pixels) for frame in frames)
     sweep = RecordedSweep(
         recording.t_us,
         recording.x,
@@ -164,6 +221,7 @@ def _run_ours(
         recording.geometry,
         recording.roi,
         held,  # type: ignore[arg-type]  # same shape as FrameFile: t_us and load()
+        frame_age_us=age_us,
     )
     started = time.process_time()
     chosen = recording.case.of_set
@@ -173,8 +231,8 @@ def _run_ours(
         recording.roi,
         Ruler.of_path(path.t_us, path.position_um),
         depth_of_focus_um=chosen.depth_of_focus_um,
-        begin_us=chosen.sweep_begin_us,
-        reference=None if picture is None else reference_from_temporal_image(picture, recording.roi),
+        begin_us=begin_us,
+        reference=reference,
     )
     found = search.run()
     cpu_ms = 1e3 * (time.process_time() - started)
@@ -228,6 +286,7 @@ def _row(
             focusing_ms = details["search_us"] / 1e3
     return Row(
         case=case.name,
+        seed=case.seed,
         set_name=case.set_name,
         scene=case.scene,
         fov=case.fov,
@@ -239,6 +298,7 @@ def _row(
         sigma_um=_or_none(sigma_us * chosen.um_per_us),
         decided_um=_or_none((decided_us - recording.truth_us) * chosen.um_per_us) if math.isfinite(focus_us) else None,
         sharpest_um=round(recording.sharpest_um, 4),
+        limit_um=_or_none(recording.sign_limit_um),
         focusing_ms=_or_none(focusing_ms),
         cpu_ms=round(cpu_ms, 3),
         reason=reason,

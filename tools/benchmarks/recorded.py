@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 
 from benchmarks.cases import Case, SweepRecording, region
+from benchmarks.limit import SignLimit
+from benchmarks.retina import RetinaEvents
 from benchmarks.sets import SETS
 from elpd.baselines.contrast import tenengrad
 from elpd.baselines.rates import vertex
@@ -21,8 +23,11 @@ from elpd.baselines.rates import vertex
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
 MOTIONS = ("static", "moderate", "violent")
 FRAME_FOLDERS = ("davis_frames_50", "davis_frames_1")
+_LIMIT_BIN_US = 2_000
 
 
 def recorded_cases(folder: Path) -> list[Case]:
@@ -64,4 +69,22 @@ def read_recorded(case: Case) -> SweepRecording:
         frames=frames,
         sharpest_um=(sharpest_us - float(truth["gt_us"])) * chosen.um_per_us,
         truth_us=float(truth["gt_us"]),
+        sign_limit_um=_sign_limit_um(case, events, frame_t_us, frames, float(truth["gt_us"])),
     )
+
+
+def _sign_limit_um(
+    case: Case, events: NDArray[Any], frame_t_us: NDArray[np.int64], frames: NDArray[np.uint8], truth_us: float
+) -> float:
+    """Return the statistical limit, with the nearest frame for the picture of the moment."""
+    chosen = case.of_set
+    limit = SignLimit(region(chosen))
+    edges_us = np.arange(int(events["t"][0]), int(events["t"][-1]) + _LIMIT_BIN_US, _LIMIT_BIN_US)
+    places = np.searchsorted(events["t"], edges_us)
+    for begin_us, begin, end in zip(edges_us, places[:-1], places[1:], strict=False):
+        part = events[begin:end]
+        seen = RetinaEvents(part["t"], part["x"], part["y"], (part["p"] > 0).astype(np.uint8))
+        middle_us = begin_us + _LIMIT_BIN_US // 2
+        nearest = frames[int(np.argmin(np.abs(frame_t_us - middle_us)))].astype(np.float32)
+        limit.add(seen, nearest, (middle_us - truth_us) * chosen.um_per_us)
+    return limit.sigma_um(chosen.depth_of_focus_um)

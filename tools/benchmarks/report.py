@@ -6,20 +6,21 @@ what a mean leaves out.
 
 from __future__ import annotations
 
-import math
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from benchmarks.calibration import BEYOND_TWO_SIGMA, draw_calibration
+from benchmarks.goals import MET, NOT_MET, UNMEASURED, measured, rate_name
 from benchmarks.methods import OURS, all_methods
 from benchmarks.plots import Plot, Series, draw
-from benchmarks.sets import MAP, SETS
+from benchmarks.sets import MAP, REBUILT, SETS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from benchmarks.calibration import Calibration
+    from benchmarks.goals import Verdict
     from benchmarks.methods import Row
     from benchmarks.scoring import Score
     from benchmarks.sets import CaseSet
@@ -28,6 +29,7 @@ PLOTTED = (
     (OURS, "50"),
     (OURS, "1"),
     (OURS, MAP),
+    (OURS, REBUILT),
     (OURS, "-"),
     ("elp-syn", "50"),
     ("elp-syn-1fps", "1"),
@@ -42,6 +44,7 @@ COLUMNS = {
     "MAE um": "mae_um",
     "bias": "bias_um",
     "worst": "worst_um",
+    "limit": "limit_um",
     "to sharpest": "to_sharpest_um",
     "missed": "missed",
     "outside": "outside",
@@ -51,7 +54,10 @@ COLUMNS = {
     "to focus ms": "focusing_ms",
     "CPU ms": "cpu_ms",
     "rms err/σ": "spread",
+    "beyond 2σ": "beyond_two",
     "paper MAE": "published_um",
+    "paper to focus ms": "published_focusing_ms",
+    "paper run ms": "published_cpu_ms",
     "rerun MAE": "rerun_um",
 }
 COUNTS_OF_TROUBLE = ("missed", "outside", "early", "wrong_way")
@@ -67,6 +73,7 @@ th, td { border-bottom: 1px solid #ddd; padding: .2rem .55rem; text-align: right
 th { background: #f4f4f4; position: sticky; top: 0 } td.word, th.word { text-align: left }
 tr.ours td { background: #eef6ff } td.bad { color: #b00020; font-weight: 600 }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem } .scroll { overflow-x: auto }
+td.so { color: #7a5c00 } td.long { white-space: normal; min-width: 24rem }
 svg text { font-family: system-ui, sans-serif; font-size: 13px } svg .small { font-size: 11px; fill: #333 }
 svg .title { font-weight: 600 } svg .frame { fill: none; stroke: #888 } svg .grid { stroke: #e8e8e8 }
 svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; font-weight: 600; margin: .8rem 0 }
@@ -74,28 +81,37 @@ svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; fon
 
 WORDS = """
 <p>One sweep per case; truth is the plane of least RMS spot radius. <b>Error</b> is estimate less truth. A mean over
-answered cases says nothing about the others: <b>missed</b> counts cases without an answer, <b>outside</b> answers
-more than one depth of focus off, <b>early</b> decisions more than that before focus, <b>wrong way</b> those that
-took the approach for receding. Where there is nothing to focus on, every answer is outside. <b>Decided</b> is how
-far past focus the lens was when the answer could first be given as it stands, the median: a method that looks at
-the whole stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the
-start of the sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE
-against the place where the noise-free picture has its highest contrast: off the axis it is not where the spot is
-smallest, and a method that looks at pictures can hardly do better than their distance. <b>CPU</b> is the median
-processor time of the method for the whole sweep, in this implementation.</p>
-<p><b>Paper</b> is the paper's MAE on its own 84 cases, for ELP an estimate made in hindsight with a built-in
-offset; <b>rerun</b> what a later paper's authors found when they ran it. The cases here follow the paper's text;
-its pictures, lens and noise are not public, so the columns stand beside each other and are not the same
-measurement.</p>
+answered cases says nothing about the others: <b>missed</b> counts cases without an answer, <b>outside</b> answers more
+than one depth of focus off, <b>early</b> decisions more than that before focus, <b>wrong way</b> those that took the
+approach for receding. Where there is nothing to focus on, every answer is outside. <b>Decided</b> is how far past
+focus the lens was when the answer could first be given as it stands, the median: a method that looks at the whole
+stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the start of the
+sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE against the place
+where the noise-free picture has its highest contrast: off the axis it is not where the spot is smallest, and a method
+that looks at pictures can hardly do better than their distance. <b>Limit</b> is the median standard deviation that the
+signs of the events around focus, held against a perfect picture, would leave at best (a Cramér-Rao-like bound,
+tools/benchmarks/limit.py): a method may beat it only by using more of an event than its sign, and a bias is not in it.
+<b>CPU</b> is the median processor time of the method for the whole sweep, in this implementation.</p>
+<p><b>Paper</b> is the paper's MAE on its own 84 cases or its own rig, for ELP an estimate made in hindsight with a
+built-in offset, and its times there, for ELP without aperture, braking and settling; <b>rerun</b> what a later
+paper's authors found when they ran it. The cases here follow the paper's text; its pictures, lens and noise are not
+public, so the columns stand beside each other and are not the same measurement.</p>
 """
 
 
-def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settings: dict[str, Any]) -> None:
+def write_report(
+    path: Path,
+    rows: Sequence[Row],
+    table: Sequence[Score],
+    goals: Sequence[Verdict],
+    truth: Sequence[Calibration],
+    settings: dict[str, Any],
+) -> None:
     """Write the report to *path*."""
     told = ", ".join(
-        f"{key} {value if not isinstance(value, list) else ' '.join(value)}" for key, value in settings.items()
+        f"{key} {' '.join(map(str, value)) if isinstance(value, list) else value}" for key, value in settings.items()
     )
-    body = [f"<h1>Autofocus benchmark</h1><p>{escape(told)}</p>", WORDS]
+    body = [f"<h1>Autofocus benchmark</h1><p>{escape(told)}</p>", _goals(goals), _calibration(rows, truth), WORDS]
     for set_name in dict.fromkeys(score.set_name for score in table):
         chosen = SETS[set_name]
         body.append(f"<h2>{escape(set_name)}: {escape(chosen.about)}</h2><p>{_setting(chosen)}</p>")
@@ -108,8 +124,10 @@ def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settin
             body.append(_score_table([score for score in own_scores if score.motion == motion]))
         body.append("<h3>How errors are distributed</h3><div class='plots'>")
         body.extend(_errors([row for row in own_rows if row.motion == motion], motion) for motion in motions)
-        body.append(_calibration(own_rows))
-        body.append("</div><h3>ELP as published, filtered, over the sweep</h3><div class='plots'>")
+        body.append(draw_calibration(own_rows, "Is the claimed standard error true?"))
+        body.append(
+            f"</div>{_per_method(own_rows)}<h3>ELP as published, filtered, over the sweep</h3><div class='plots'>"
+        )
         body.extend(_curves(own_rows, motions))
         body.append("</div>")
         body.append(_case_table(own_rows))
@@ -120,13 +138,50 @@ def write_report(path: Path, rows: Sequence[Row], table: Sequence[Score], settin
     path.write_text(page, encoding="utf-8")
 
 
+def _goals(goals: Sequence[Verdict]) -> str:
+    """Return the table of goals: what was asked, by whom it was measured, the verdict, what others have."""
+    told = (
+        "Computed from the rows of this run. “Recorded sweeps” are estimates of the causal detector; "
+        "cycles of the simulated rig, with a lens that comes to rest, are named by their file."
+    )
+    heads = ("goal", "measured on", "trials", "measured", "verdict", "beside")
+    names = "".join(f"<th class='word'>{head}</th>" for head in heads)
+    lines = [f"<h2>Goals</h2><p>{told}</p><div class='scroll'><table><tr>{names}</tr>"]
+    for one in goals:
+        kind = "word" if one.verdict in (MET, UNMEASURED) else "word bad" if one.verdict == NOT_MET else "word so"
+        words = (one.goal, one.source, f"{one.trials} of {one.wanted}", measured(one) if one.trials else "–")
+        cells = "".join(f"<td class='word'>{escape(word)}</td>" for word in words)
+        beside = f"<td class='word long'>{escape(one.beside)}</td>"
+        lines.append(f"<tr>{cells}<td class='{kind}'>{one.verdict}</td>{beside}</tr>")
+    return "".join(lines) + "</table></div>"
+
+
+def _calibration(rows: Sequence[Row], truth: Sequence[Calibration]) -> str:
+    """Return how true our standard errors are: the quantile plot over all sets, and numbers for each."""
+    if not truth:
+        return ""
+    told = f"By set, motion and frame rate: RMS of error/σ (true: 1), share beyond 2σ (normal: {BEYOND_TWO_SIGMA:.1%})"
+    lines = [
+        "<h2>Is the claimed standard error true?</h2><div class='plots'>",
+        draw_calibration(rows, "All sets"),
+        f"</div><details><summary>{told}</summary><table><tr><th class='word'>answers of</th>",
+        "<th>answers</th><th>rms err/σ</th><th>beyond 2σ</th></tr>",
+    ]
+    for one in truth:
+        lines.append(f"<tr><td class='word'>{escape(one.name)}</td><td>{one.answers}</td>")
+        lines.append(f"<td>{one.rms:.2f}</td><td>{one.beyond_two:.1%}</td></tr>")
+    return "".join(lines) + "</table></details>"
+
+
 def _setting(chosen: CaseSet) -> str:
     sensor = chosen.retina
+    travel_um = chosen.um_per_us * chosen.exposure_us
+    exposed = f", frames exposed for {chosen.exposure_us / 1e3:g} ms ({travel_um:g} um)" if chosen.exposure_us else ""
     return (
         f"From {chosen.start_um:g} to {-chosen.start_um:g} um at {chosen.speed_um_s / 1e3:g} um/ms, depth of focus "
         f"{chosen.depth_of_focus_um:g} um, {chosen.size_px} x {chosen.size_px} pixels, thresholds {sensor.pos_thres:g} "
         f"± {sensor.sigma_thres:g}, photoreceptor {sensor.cutoff_hz:g} Hz, shot noise {sensor.shot_noise_rate_hz:g} Hz "
-        f"a pixel, a pixel of motion is {chosen.motion_px:.2g} of the sensor's."
+        f"a pixel, a pixel of motion is {chosen.motion_px:.2g} of the sensor's{exposed}."
     )
 
 
@@ -178,17 +233,19 @@ def _cell(value: float | None, name: str) -> str:
 def _case_table(rows: Sequence[Row]) -> str:
     """Return every case's errors: a line per case, a column per method and frame rate."""
     pairs = list(dict.fromkeys((row.method, row.rate) for row in rows))
-    by_case: dict[str, dict[tuple[str, str], Row]] = {}
+    by_case: dict[tuple[str, int], dict[tuple[str, str], Row]] = {}
     for row in rows:
-        by_case.setdefault(row.case, {})[row.method, row.rate] = row
+        by_case.setdefault((row.case, row.seed), {})[row.method, row.rate] = row
     heads = "".join(f"<th>{escape(method)}<br>{rate}</th>" for method, rate in pairs)
     lines = [
         "<details><summary>Every case: error in um, “/” where there was no answer (its reason on hover)</summary>",
-        f"<div class='scroll'><table><tr><th class='word'>case</th><th>events</th>{heads}</tr>",
+        "<div class='scroll'><table><tr><th class='word'>case</th><th>seed</th><th>events</th><th>limit</th>",
+        f"{heads}</tr>",
     ]
-    for case, found in by_case.items():
-        events = next(iter(found.values())).events
-        lines.append(f"<tr><td class='word'>{escape(case)}</td><td>{events}</td>")
+    for (case, seed), found in by_case.items():
+        any_row = next(iter(found.values()))
+        lines.append(f"<tr><td class='word'>{escape(case)}</td><td>{seed}</td><td>{any_row.events}</td>")
+        lines.append(f"<td>{_number(any_row.limit_um)}</td>")
         for pair in pairs:
             row = found[pair]
             if row.error_um is None:
@@ -220,31 +277,40 @@ def _errors(rows: Sequence[Row], motion: str) -> str:
     )  # fmt: skip
 
 
-def _calibration(rows: Sequence[Row]) -> str:
-    """Draw |error|/sigma of our own answers against what a normal error would give."""
-    grid = np.linspace(0.05, 5.0, 100)
-    normal = [math.erf(x / math.sqrt(2.0)) for x in grid]
-    series = [Series("normal", grid.tolist(), normal)]
-    for rate in all_methods()[OURS].rates:
-        own = [row for row in rows if (row.method, row.rate) == (OURS, rate)]
-        ratios = np.array(
-            [abs(row.error_um) / row.sigma_um for row in own if row.error_um is not None and row.sigma_um]
-        )
-        if ratios.size:
-            shares = [(ratios <= x).mean() for x in grid]
-            series.append(Series(_label(OURS, rate), grid.tolist(), shares))
-    title = "Is the claimed standard error true?"
-    return draw(Plot(title, "|error| / claimed sigma", "share of answers", series, y_range=(0.0, 1.0)))
+def _per_method(rows: Sequence[Row]) -> str:
+    """Draw each method's signed errors, a line per motion and frame rate: the share of all its cases below x."""
+    plots = []
+    for name in dict.fromkeys(row.method for row in rows):
+        own = [row for row in rows if row.method == name]
+        series = []
+        for motion, rate in dict.fromkeys((row.motion, row.rate) for row in own):
+            group = [row for row in own if (row.motion, row.rate) == (motion, rate)]
+            errors = sorted(row.error_um for row in group if row.error_um is not None)
+            corners = [corner for error in errors for corner in (error, error)]
+            shares = [step / len(group) for k in range(len(errors)) for step in (k, k + 1)]
+            series.append(Series(f"{motion}, {rate}", corners, shares))
+        limit_um = 4.0 * SETS[own[0].set_name].depth_of_focus_um
+        title = f"{all_methods()[name].title}: signed error"
+        plots.append(
+            draw(
+                Plot(
+                    title, "error um (late is positive)", "share of cases below", series,
+                    x_range=(-limit_um, limit_um), y_range=(0.0, 1.0), marks=[(0.0, "truth")],
+                )
+            )
+        )  # fmt: skip
+    told = "Every method's signed errors; what lies further out than four depths of focus is drawn at the edge"
+    return f"<details><summary>{told}</summary><div class='plots'>{''.join(plots)}</div></details>"
 
 
 def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
     """Draw the published ELP of the first case of each motion, at 50 fps and with the one future frame."""
     plots = []
     for motion in motions:
-        first = next((row.case for row in rows if row.motion == motion and "curve" in row.details), None)
+        first = next(((row.case, row.seed) for row in rows if row.motion == motion and "curve" in row.details), None)
         series, marks = [], [(0.0, "truth")]
         for row in rows:
-            if row.case != first or "curve" not in row.details:
+            if (row.case, row.seed) != first or "curve" not in row.details:
                 continue
             curve = row.details["curve"]
             series.append(
@@ -256,12 +322,14 @@ def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
             )
             if row.decided_um is not None:
                 marks.append((row.decided_um, f"decided, {_label(row.method, row.rate)}"))
-        plots.append(draw(Plot(str(first), "lens position um", "ELP per event", series, marks=marks)))
+        plots.append(
+            draw(Plot("" if first is None else first[0], "lens position um", "ELP per event", series, marks=marks))
+        )
     return plots
 
 
 def _label(method: str, rate: str) -> str:
-    return method if rate == "-" and method != OURS else f"{method}, {'no frames' if rate == '-' else rate + ' fps'}"
+    return method if rate == "-" and method != OURS else f"{method}, {rate_name(rate)}"
 
 
 def _number(value: float | None, *, signed: bool = False) -> str:

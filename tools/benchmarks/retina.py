@@ -129,6 +129,10 @@ class Retina:
         )
         self._level, self._t_us, self._noise_next = level, t_us, stop
 
+    def newest(self) -> RetinaEvents:
+        """Return the events of the last interval."""
+        return self._parts[-1]
+
     def events(self) -> RetinaEvents:
         """Return everything so far."""
         return joined(self._parts)

@@ -1,4 +1,4 @@
-"""Runs methods over cases, in this process or several, so that it can be stopped and taken up again.
+"""Runs methods over cases, so that it can be stopped and taken up again.
 
 The unit of work is a case: made once, shown to every method, its rows written to one file that appears whole or not at
 all. A run that is resumed reads those files and does only what is missing. Rows come back in any order and are sorted,
@@ -9,81 +9,108 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from benchmarks.cases import GENERATION, load_or_make
+from benchmarks.executors import spread
 from benchmarks.methods import NO_FRAMES, Row, all_methods, run_method
 from benchmarks.recorded import read_recorded
-from benchmarks.sets import MAP, SETS
+from benchmarks.sets import E2VID, MAP, REBUILT, SETS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Sequence
     from pathlib import Path
 
     from benchmarks.cases import Case
 
-EXECUTORS = ("joblib", "serial")
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a worker is given: a case, the (method, rate) pairs to run, where cases are kept, and E2VID's weights."""
+
+    case: Case
+    wanted: tuple[tuple[str, str], ...]
+    cache: Path | None
+    weights: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One case, the (method, rate) pairs wanted of it, where its rows go and where cases are kept.
+    """A task and where its rows go. What an earlier run left of the methods in ``redo`` is forgotten."""
 
-    What an earlier run left of the methods in ``redo`` is forgotten.
-    """
-
-    case: Case
-    wanted: tuple[tuple[str, str], ...]
+    task: Task
     rows_folder: Path
-    cache: Path | None
     redo: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
         """The file of this case's rows."""
-        return self.rows_folder / f"{self.case.name}-seed{self.case.seed}.json"
+        return self.rows_folder / f"{self.task.case.name}-seed{self.task.case.seed}.json"
 
 
-def wanted_pairs(set_name: str, methods: Sequence[str], rates: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Return the (method, rate) pairs to run on a set; what needs no frames runs whatever *rates* says."""
+def wanted_pairs(
+    set_name: str, methods: Sequence[str], rates: Sequence[str], *, with_e2vid: bool = False
+) -> tuple[tuple[str, str], ...]:
+    """Return the (method, rate) pairs to run on a set.
+
+    What needs no frames runs whatever *rates* says, and so do pictures made from events: E2VID's *with_e2vid*.
+    """
     known = all_methods()
-    there = [rate for rate in SETS[set_name].rates if rate in rates or rate == MAP]
+    always = {MAP, REBUILT} | ({E2VID} if with_e2vid else set())
+    there = [rate for rate in SETS[set_name].rates if rate in rates or rate in always]
     return tuple((name, rate) for name in methods for rate in known[name].rates if rate == NO_FRAMES or rate in there)
 
 
-def known_rows(work: Work) -> list[Row]:
-    """Return the rows that an earlier run left for this case; none if they are of another generation of cases."""
+def known_rows(work: Work) -> dict[tuple[str, str], Row]:
+    """Return the rows that an earlier run left for this case, by method and rate."""
     if not work.path.is_file():
-        return []
+        return {}
     kept = json.loads(work.path.read_text(encoding="utf-8"))
     if kept["generation"] != GENERATION:
-        return []
-    return [Row(**row) for row in kept["rows"] if row["method"] not in work.redo]
+        return {}
+    rows = (Row(**row) for row in kept["rows"] if row["method"] not in work.redo)
+    return {(row.method, row.rate): row for row in rows}
 
 
-def run_case(work: Work) -> list[Row]:
-    """Return the rows wanted of one case: those that exist, and the rest after running them."""
-    known = {(row.method, row.rate): row for row in known_rows(work)}
-    missing = [pair for pair in work.wanted if pair not in known]
-    if missing:
-        methods = all_methods()
-        recorded = work.case.folder is not None
-        recording = read_recorded(work.case) if recorded else load_or_make(work.case, work.cache)
-        for name, rate in missing:
-            known[name, rate] = run_method(methods[name], rate, recording)
-        kept = {"generation": GENERATION, "rows": [row.as_dict() for row in known.values()]}
-        aside = work.path.with_suffix(f".{os.getpid()}.tmp")
-        aside.write_text(json.dumps(kept), encoding="utf-8")
-        aside.replace(work.path)
-    return [known[pair] for pair in work.wanted]
+def finished(work: Work) -> bool:
+    """Say whether nothing is left to do for this case."""
+    return set(work.task.wanted) <= set(known_rows(work))
 
 
-def run_all(works: Sequence[Work], executor: str, jobs: int) -> Iterator[list[Row]]:
-    """Yield each case's rows as they come, in no particular order."""
-    if executor == "serial" or jobs == 1:
-        yield from map(run_case, works)
+def run_task(task: Task) -> list[Row]:
+    """Make the case, or read it, and run what is wanted of it."""
+    methods = all_methods()
+    made = read_recorded(task.case) if task.case.folder is not None else load_or_make(task.case, task.cache)
+    return [run_method(methods[name], rate, made, task.weights) for name, rate in task.wanted]
+
+
+def run_all(
+    works: Sequence[Work], executor: str, jobs: int, scheduler: str | None = None
+) -> Generator[tuple[Work, list[Row]]]:
+    """Yield each case's rows as they come, in no particular order; each is kept before it is yielded."""
+    open_works, tasks = [], []
+    for work in works:
+        known = known_rows(work)
+        missing = tuple(pair for pair in work.task.wanted if pair not in known)
+        if missing:
+            open_works.append((work, known))
+            tasks.append(Task(work.task.case, missing, work.task.cache, work.task.weights))
+        else:
+            yield work, [known[pair] for pair in work.task.wanted]
+    if not tasks:
         return
-    from joblib import Parallel, delayed  # type: ignore[import-untyped]  # noqa: PLC0415  (optional)
+    with closing(spread(run_task, tasks, executor, jobs, scheduler)) as answers:
+        for number, rows in answers:
+            work, known = open_works[number]
+            known |= {(row.method, row.rate): row for row in rows}
+            _keep(work, list(known.values()))
+            yield work, [known[pair] for pair in work.task.wanted]
 
-    yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(run_case)(work) for work in works)
+
+def _keep(work: Work, rows: Sequence[Row]) -> None:
+    kept = {"generation": GENERATION, "rows": [row.as_dict() for row in rows]}
+    aside = work.path.with_suffix(f".{os.getpid()}.tmp")
+    aside.write_text(json.dumps(kept), encoding="utf-8")
+    aside.replace(work.path)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.published import published_mae_um, rerun_mae_um
+from benchmarks.published import published_mae_um, published_times_ms, rerun_mae_um
 from benchmarks.sets import SETS
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ class Score:
     ``missed`` had no answer, ``outside`` one more than a depth of focus from the truth, ``early`` a decision more than
     a depth of focus before it, ``wrong_way`` took the approach for receding. Where nothing is there to be focused on,
     every answer is outside. ``to_sharpest_um`` is the MAE against the sharpest picture. ``spread`` is the RMS of error
-    over claimed sigma; honest sigmas make it one.
+    over claimed sigma, honest sigmas make it one, ``beyond_two`` the share of errors beyond two sigma. ``limit_um`` is
+    the median of the cases' statistical limits to scatter (``limit``).
     """
 
     set_name: str
@@ -47,7 +48,11 @@ class Score:
     focusing_ms: float | None
     cpu_ms: float
     spread: float | None
+    beyond_two: float | None
+    limit_um: float | None
     published_um: float | None
+    published_focusing_ms: float | None
+    published_cpu_ms: float | None
     rerun_um: float | None
 
     def as_dict(self) -> dict[str, Any]:
@@ -71,6 +76,7 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
     decided = np.array([row.decided_um for row in rows if row.decided_um is not None], dtype=np.float64)
     focusing = np.array([row.focusing_ms for row in rows if row.focusing_ms is not None], dtype=np.float64)
     claimed = np.array([row.error_um / row.sigma_um for row in rows if row.error_um is not None and row.sigma_um])
+    limits = np.array([row.limit_um for row in rows if row.limit_um is not None], dtype=np.float64)
     apart = np.array([row.error_um - row.sharpest_um for row in rows if row.error_um is not None])
     answered = errors.size > 0
     return Score(
@@ -91,6 +97,10 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
         focusing_ms=round(float(np.median(focusing)), 1) if focusing.size else None,
         cpu_ms=round(float(np.median([row.cpu_ms for row in rows])), 2),
         spread=round(float(np.sqrt(np.mean(claimed**2))), 3) if claimed.size else None,
-        published_um=published_mae_um(method, rate, motion) if set_name == "syn" else None,
+        beyond_two=round(float((np.abs(claimed) > 2.0).mean()), 4) if claimed.size else None,
+        limit_um=round(float(np.median(limits)), 3) if limits.size else None,
+        published_um=published_mae_um(set_name, method, rate, motion),
+        published_focusing_ms=published_times_ms(set_name, method)[1],
+        published_cpu_ms=published_times_ms(set_name, method)[0],
         rerun_um=rerun_mae_um(method, rate, motion) if set_name == "syn" else None,
     )

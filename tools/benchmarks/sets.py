@@ -8,11 +8,14 @@ and motion in the sensor's pixels, which is harder. Frames are instantaneous and
 The ``davis`` and ``evk4`` sets are like the paper's rig: 2 mm/s, 200 um either side of focus, a depth of focus of 6 um
 (the same traced lens, 2.67 um of defocus to a um of travel), bright or dark, the scene still, moving as in a hand, or
 shaking. Only the region that matters is simulated, with a margin, in place of the whole sensor. ``davis`` has frames,
-noisy ones; ``evk4`` has none: its record begins with an aperture that opens in 20 ms, from which a picture must be
-made.
+noisy ones, exposed for 5 ms in good light (as in the simulated rig) and 20 ms in the dark: the light of every 250 us
+of the exposure is averaged, so scene and lens blur them as they go on moving (10 and 40 um of travel), and a frame is
+there only when its read-out of 4 ms is over. Its time stamp is the middle of its exposure. ``evk4`` has no frames: its
+record begins with an aperture that opens in 20 ms, from which a picture must be made.
 
-``flicker`` and ``nothing`` are there to be refused: a lamp that flickers by 30 %, and a wall, a grey card and a lens
-cap, of which nothing but noise can be seen.
+``flicker``, ``nothing`` and ``noise`` are there to be refused: a lamp that flickers by 30 %; a wall, a grey card and a
+lens cap, of which nothing but noise can be seen; and the
+same with a sensor that makes 20 Hz of noise in every pixel.
 
 The ``third`` sets are recorded (``--recorded``), not made here.
 """
@@ -32,6 +35,12 @@ FRAME_PERIODS_US = {"50": 20_000, "20": 50_000, "1": SECOND_US}
 MAP = "map"
 """In place of a frame rate: the one picture that an opening aperture gives."""
 
+REBUILT = "rebuilt"
+"""In its place, for the ablation: a picture made from the first events of the sweep by a high-pass filter."""
+
+E2VID = "e2vid"
+"""The same by E2VID, where there are weights for it."""
+
 
 @dataclass(frozen=True, slots=True)
 class CaseSet:
@@ -40,6 +49,8 @@ class CaseSet:
     Lengths in um are of lens travel; ``defocus_per_um`` turns them into defocus behind the traced lens. ``motion_px``
     is a pixel of motion in pixels of the sensor, ``flicker`` the amplitude of a 100 Hz lamp. ``rates`` are the frame
     rates that exist. ``expose`` is the sensor's setting while the aperture opens, ``None`` without an aperture.
+    Frames gather light for ``exposure_us``, a multiple of two steps or none at all, and are there ``read_out_us``
+    later.
     """
 
     name: str
@@ -59,6 +70,8 @@ class CaseSet:
     step_us: int = 1_000
     keep_every_us: int = 10_000
     frame_noise_dn: float = 0.0
+    exposure_us: int = 0
+    read_out_us: int = 0
     expose: RetinaSettings | None = None
     scenes: tuple[str, ...] = SCENES
     flicker: float = 0.0
@@ -72,6 +85,11 @@ class CaseSet:
     def sweep_begin_us(self) -> int:
         """When the lens starts: after the aperture has opened and rested."""
         return 0 if self.expose is None else APERTURE_US + APERTURE_REST_US
+
+    @property
+    def frame_age_us(self) -> int:
+        """How old the middle of a frame's exposure is when the frame is there."""
+        return self.read_out_us + self.exposure_us // 2
 
     @property
     def truth_us(self) -> float:
@@ -95,6 +113,7 @@ class CaseSet:
 
 APERTURE_US = 20_000
 APERTURE_REST_US = 5_000
+_READ_OUT_US = 4_000
 
 # The setting under which the paper's code reproduces the paper's table (third-party finding), and v2e's defaults.
 C05 = RetinaSettings(0.05, 0.05, 0.01)
@@ -102,11 +121,13 @@ STD = RetinaSettings(0.2, 0.2, 0.03)
 # A photoreceptor of 2 kHz in good light; ten times slower and fifty times noisier in the dark.
 BRIGHT = RetinaSettings(0.2, 0.2, 0.02, cutoff_hz=2_000.0, leak_rate_hz=0.1, shot_noise_rate_hz=0.1)
 DARK = RetinaSettings(0.2, 0.2, 0.02, cutoff_hz=200.0, leak_rate_hz=0.1, shot_noise_rate_hz=5.0)
+NOISY = RetinaSettings(0.2, 0.2, 0.02, cutoff_hz=200.0, leak_rate_hz=0.1, shot_noise_rate_hz=20.0)
 # Biases for the aperture: a high ON threshold, and a refractory period that leaves one event to a pixel.
 EXPOSE = RetinaSettings(
     0.4, 0.4, 0.02, cutoff_hz=3_000.0, shot_noise_rate_hz=0.1, refractory_period_s=1.0, settled=True
 )
 
+_PICTURES = (MAP, REBUILT, E2VID)
 _PAPER_MOTIONS = ("static", "moderate", "violent")
 _RIG_MOTIONS = ("static", "dynamic", "shake")
 
@@ -125,6 +146,20 @@ def _rig(name: str, about: str, retina: RetinaSettings, rates: tuple[str, ...], 
     return CaseSet(name, about, retina, rates=rates, **(common | more))  # type: ignore[arg-type]  # fields by name
 
 
+def _davis(name: str, about: str, retina: RetinaSettings, **more: object) -> CaseSet:
+    common: dict[str, object] = {
+        "rates": ("50", "1"),
+        "size_px": 160,
+        "frame_noise_dn": 1.0,
+        "exposure_us": 5_000,
+        "read_out_us": _READ_OUT_US,
+    }
+    return _rig(name, about, retina, **(common | more))  # type: ignore[arg-type]  # fields by name
+
+
+_DIM: dict[str, object] = {"rates": ("20", "1"), "frame_noise_dn": 4.0, "exposure_us": 20_000}
+_BLANK: dict[str, object] = {"fields": (1, 2, 3, 4), "scenes": BLANKS}
+
 SETS = {
     one.name: one
     for one in (
@@ -132,20 +167,12 @@ SETS = {
         CaseSet("syn-std", "the same, threshold 0.2", STD, _PAPER_MOTIONS, (1, 2, 3, 4), ("50", "20", "1")),
         CaseSet("third-c05", "third-party sweeps, threshold 0.05", C05, (), (), ("50", "20", "1"), 1.0 / 3.0),
         CaseSet("third-std", "third-party sweeps, threshold 0.2", STD, (), (), ("50", "20", "1")),
-        _rig("davis-bright", "like a DAVIS346, bright", BRIGHT, ("50", "1"), size_px=160, frame_noise_dn=1.0),
-        _rig("davis-dark", "like a DAVIS346, dark", DARK, ("20", "1"), size_px=160, frame_noise_dn=4.0),
-        _rig("evk4-bright", "like an EVK4, events only, bright", BRIGHT, (MAP,), size_px=240, expose=EXPOSE),
-        _rig("evk4-dark", "like an EVK4, events only, dark", DARK, (MAP,), size_px=240, expose=EXPOSE),
-        _rig("flicker", "like a DAVIS346, bright, a lamp of 30 %", BRIGHT, ("50", "1"), size_px=160, flicker=0.3),
-        _rig(
-            "nothing",
-            "like a DAVIS346, dark, nothing to see",
-            DARK,
-            ("20", "1"),
-            size_px=160,
-            frame_noise_dn=4.0,
-            fields=(1, 2, 3, 4),
-            scenes=BLANKS,
-        ),
+        _davis("davis-bright", "like a DAVIS346, bright", BRIGHT),
+        _davis("davis-dark", "like a DAVIS346, dark", DARK, **_DIM),
+        _rig("evk4-bright", "like an EVK4, events only, bright", BRIGHT, _PICTURES, size_px=240, expose=EXPOSE),
+        _rig("evk4-dark", "like an EVK4, events only, dark", DARK, _PICTURES, size_px=240, expose=EXPOSE),
+        _davis("flicker", "like a DAVIS346, bright, a lamp of 30 %", BRIGHT, flicker=0.3),
+        _davis("nothing", "like a DAVIS346, dark, nothing to see", DARK, **_DIM, **_BLANK),
+        _davis("noise", "the same, 20 Hz of noise a pixel", NOISY, **_DIM, **_BLANK),
     )
 }

@@ -1,0 +1,298 @@
+"""What the controller is to show, what was measured, and whether the one meets the other.
+
+Every verdict is computed from rows. ``met`` and ``not met`` need every sweep that the goal is about. On some of them a
+mean holds or does not hold *so far*, while one answer that must never be given is enough to break a goal. What nobody
+measured says so. Rows of the benchmark are the detector's on
+recorded sweeps: an estimate, causal, without a lens to stop. What a lens did comes from ``tools/acceptance.py`` and
+stands beside it under the run's name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.cases import cases_of
+from benchmarks.methods import NO_FRAMES, OURS
+from benchmarks.published import SYN_MAE_UM, published_mae_um, rerun_mae_um
+from benchmarks.sets import E2VID, MAP, REBUILT, SETS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from benchmarks.live import LiveRun
+    from benchmarks.methods import Row
+
+MET, NOT_MET, UNMEASURED = "met", "not met", "not measured"
+SO_FAR = " so far"
+OFFLINE = "recorded sweeps"
+BESIDE = ("egs", "pbf", "esva", "elp-syn", "elp-syn-1fps", "elp-davis", "elp-evk4")
+"""The peers whose means on the same sweeps stand beside ours."""
+
+TRIALS = 200
+EARLY_SHARE = 0.02
+ABSTAIN_SHARE, ABSTAIN_SHARE_SHAKE = 0.05, 0.10
+ONE_WAY_MS = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """A goal for the mean error on one set, motion and frame rate; beside it the paper's claim, if it is another."""
+
+    set_name: str
+    motion: str
+    rate: str
+    mae_um: float
+    claim: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A line of the table: the goal, who measured it on how many of how many trials, what, and what others have."""
+
+    goal: str
+    source: str
+    trials: int
+    wanted: int
+    mae_um: float | None = None
+    worst_um: float | None = None
+    missed: int | None = None
+    abstained_share: float | None = None
+    outside: int | None = None
+    early: int | None = None
+    other: str = ""
+    beside: str = ""
+    verdict: str = UNMEASURED
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the line as plain data."""
+        return asdict(self)
+
+
+_HINDSIGHT_DAVIS, _HINDSIGHT_EVK4 = "paper: ELP 0.29 in hindsight", "paper: ELP 0.57 in hindsight"
+ACCURACY = (
+    Accuracy("syn", "static", "50", 1.0),
+    Accuracy("syn", "moderate", "50", 1.2),
+    Accuracy("syn", "violent", "50", 2.0),
+    Accuracy("syn", "static", "20", 1.0),
+    Accuracy("syn", "moderate", "20", 1.6),
+    Accuracy("syn", "violent", "20", 2.5),
+    Accuracy("syn", "static", "1", 1.0),
+    Accuracy("syn", "moderate", "1", 2.5),
+    Accuracy("syn", "violent", "1", 3.5),
+    Accuracy("davis-bright", "static", "50", 0.6, _HINDSIGHT_DAVIS),
+    Accuracy("davis-bright", "dynamic", "50", 1.5, _HINDSIGHT_DAVIS),
+    Accuracy("davis-dark", "static", "20", 1.0, _HINDSIGHT_DAVIS),
+    Accuracy("davis-dark", "dynamic", "20", 2.0, _HINDSIGHT_DAVIS),
+    Accuracy("evk4-bright", "static", MAP, 0.8, _HINDSIGHT_EVK4),
+    Accuracy("evk4-bright", "dynamic", MAP, 2.3, _HINDSIGHT_EVK4),
+    Accuracy("evk4-dark", "static", MAP, 1.2, _HINDSIGHT_EVK4),
+    Accuracy("evk4-dark", "dynamic", MAP, 3.0, _HINDSIGHT_EVK4),
+    Accuracy("davis-bright", "shake", "50", 2.5, "nobody reports it"),
+    Accuracy("evk4-bright", "shake", MAP, 5.0, "nobody reports it"),
+)
+
+
+def verdicts(rows: Sequence[Row], live: Sequence[LiveRun] = ()) -> list[Verdict]:
+    """Return every goal with what was measured of it."""
+    by_goal = {goal: _rows_of(goal, rows) for goal in ACCURACY}
+    table = []
+    for goal in ACCURACY:
+        table.append(_accuracy(goal, by_goal[goal], rows))
+        table.extend(run.accuracy(goal) for run in live if run.concerns(goal))
+    shaken = {goal: found for goal, found in by_goal.items() if goal.motion == "shake"}
+    still = {goal: found for goal, found in by_goal.items() if goal.motion != "shake"}
+    table.append(_abstentions("abstentions over all sets above but shake", still, ABSTAIN_SHARE))
+    table.append(_abstentions("abstentions in shake", shaken, ABSTAIN_SHARE_SHAKE))
+    table.append(_nothing(rows))
+    table.append(_direction(rows, "static", 0, "paper: 40 % wrong without Laplacian"))
+    table.append(_direction(rows, "violent", 1))
+    for run in live:
+        table.extend(run.others())
+    if not live:
+        table.append(
+            Verdict("200 um to rest within 100 ms at 4 mm/s (160 with two crossings)", "tools/acceptance.py", 0, 1)
+        )
+    return table
+
+
+def state(*, over: bool, trials: int, wanted: int, broken: bool = False) -> str:
+    """Return the verdict in words.
+
+    *over* says that a mean or a share is over its limit, which more trials may change; *broken* what none can mend.
+    """
+    if trials == 0:
+        return UNMEASURED
+    if broken:
+        return NOT_MET
+    return (NOT_MET if over else MET) + ("" if trials >= wanted else SO_FAR)
+
+
+def direction_state(wrong: int, allowed: int, trials: int) -> str:
+    """Return the verdict on directions: so many wrong of so many, in proportion where there are more than 200."""
+    over = wrong > allowed * max(1.0, trials / TRIALS)
+    return state(over=over, broken=over and allowed == 0, trials=trials, wanted=TRIALS)
+
+
+def tell(table: Sequence[Verdict]) -> list[str]:
+    """Return the table as lines of text."""
+    lines = []
+    for one in table:
+        parts = [f"{one.verdict:14s} {one.goal}"]
+        if one.trials:
+            parts.append(f"{one.source}, {one.trials} of {one.wanted}: {measured(one)}")
+        lines.append("  ".join(parts))
+    return lines
+
+
+def measured(one: Verdict) -> str:
+    """Return what was measured, in words."""
+    numbers = {"MAE {:.2f} um": one.mae_um, "worst {:.2f} um": one.worst_um, "{} without answer": one.missed or None}
+    numbers |= {
+        "{:.1%} abstained": one.abstained_share,
+        "{} OUTSIDE": one.outside or None,
+        "{} early": one.early or None,
+    }
+    told = [words.format(value) for words, value in numbers.items() if value is not None]
+    return ", ".join([*told, one.other] if one.other else told) or "nothing to report"
+
+
+def _rows_of(goal: Accuracy, rows: Iterable[Row]) -> list[Row]:
+    place = (goal.set_name, goal.motion, goal.rate, OURS)
+    return [row for row in rows if (row.set_name, row.motion, row.rate, row.method) == place]
+
+
+def _seeds(rows: Iterable[Row]) -> int:
+    return max(len({row.seed for row in rows}), 1)
+
+
+def _accuracy(goal: Accuracy, found: Sequence[Row], rows: Sequence[Row]) -> Verdict:
+    limit_um = SETS[goal.set_name].depth_of_focus_um
+    errors = np.array([abs(row.error_um) for row in found if row.error_um is not None])
+    missed, outside = len(found) - errors.size, int((errors > limit_um).sum())
+    early = sum(row.decided_um is not None and row.decided_um < -limit_um for row in found)
+    every = goal.set_name == "syn"
+    words = f"{goal.set_name} {goal.motion}, {rate_name(goal.rate)}: MAE at most {goal.mae_um:g} um, "
+    words += f"every case within {limit_um:g} um" if every else f"none FOCUSED outside {limit_um:g} um"
+    if goal.motion == "shake":
+        words += f", early below {EARLY_SHARE:.0%}"
+    mae_um = float(errors.mean()) if errors.size else None
+    over = mae_um is None or mae_um > goal.mae_um
+    over = over or (goal.motion == "shake" and early >= EARLY_SHARE * len(found))
+    broken = outside > 0 or (every and missed > 0)
+    wanted = len(cases_of(goal.set_name, 0, f"*-{goal.motion}")) * _seeds(rows)
+    return Verdict(
+        words,
+        OFFLINE,
+        len(found),
+        wanted,
+        mae_um=mae_um,
+        worst_um=float(errors.max()) if errors.size else None,
+        missed=missed,
+        abstained_share=missed / len(found) if found else None,
+        outside=outside,
+        early=early,
+        beside=_beside(goal, rows),
+        verdict=state(over=over, broken=broken, trials=len(found), wanted=wanted),
+    )
+
+
+def rate_name(rate: str) -> str:
+    """Return a frame rate in words."""
+    return {MAP: "temporal map", REBUILT: "rebuilt picture", E2VID: "E2VID picture", NO_FRAMES: "no frames"}.get(
+        rate, f"{rate} fps"
+    )
+
+
+def _beside(goal: Accuracy, rows: Sequence[Row]) -> str:
+    """Return what the peers measured on the same sweeps, and what the literature claims on its own."""
+    told = [goal.claim] if goal.claim else []
+    if goal.set_name == "syn":
+        for name, rate in SYN_MAE_UM:
+            published = published_mae_um("syn", name, rate, goal.motion)
+            if rate in (NO_FRAMES, goal.rate) and published is not None:
+                told.append(f"paper: {name} {published:.2f}")
+        rerun = rerun_mae_um("esva", NO_FRAMES, goal.motion)
+        told.append(f"its authors: esva {rerun:.1f}")
+    here = []
+    for name in BESIDE:
+        own = [
+            row
+            for row in rows
+            if (row.set_name, row.motion, row.method) == (goal.set_name, goal.motion, name)
+            and row.rate in (NO_FRAMES, goal.rate)
+        ]
+        errors = [abs(row.error_um) for row in own if row.error_um is not None]
+        if own:
+            without = f" ({len(own) - len(errors)} without answer)" if len(errors) < len(own) else ""
+            here.append(f"{name} {np.mean(errors):.1f}{without}" if errors else f"{name} no answer")
+    return "; ".join(told + (["here: " + ", ".join(here)] if here else []))
+
+
+def _abstentions(words: str, by_goal: dict[Accuracy, list[Row]], limit: float) -> Verdict:
+    found = [row for rows in by_goal.values() for row in rows]
+    missed = sum(row.error_um is None for row in found)
+    wanted = sum(len(cases_of(goal.set_name, 0, f"*-{goal.motion}")) for goal in by_goal) * _seeds(found)
+    share = missed / len(found) if found else None
+    return Verdict(
+        f"{words}: below {limit:.0%}",
+        OFFLINE,
+        len(found),
+        wanted,
+        missed=missed,
+        abstained_share=share,
+        verdict=state(over=share is not None and share >= limit, trials=len(found), wanted=wanted),
+    )
+
+
+def _sweeps(rows: Iterable[Row]) -> int:
+    """Count sweeps; one sweep seen with other frames is no other sweep."""
+    return len({(row.case, row.seed) for row in rows})
+
+
+def _nothing(rows: Sequence[Row]) -> Verdict:
+    names = [name for name, one in SETS.items() if one.nothing_there or one.flicker > 0.0]
+    found = [row for row in rows if row.method == OURS and row.set_name in names]
+    false = [
+        row
+        for row in found
+        if row.error_um is not None
+        and (SETS[row.set_name].nothing_there or abs(row.error_um) > SETS[row.set_name].depth_of_focus_um)
+    ]
+    sweeps = _sweeps(found)
+    return Verdict(
+        f"flat, cap, noise, flicker 30 %: 0 false FOCUSED in {TRIALS}",
+        OFFLINE,
+        sweeps,
+        TRIALS,
+        outside=len(false),
+        other=f"{len(false)} false in {len(found)} runs on {sweeps} sweeps",
+        verdict=state(over=False, broken=bool(false), trials=sweeps, wanted=TRIALS),
+    )
+
+
+def _direction(rows: Sequence[Row], motion: str, allowed: int, beside: str = "") -> Verdict:
+    """Every sweep here begins before focus; from behind it, see the live runs."""
+    shown = [
+        row
+        for row in rows
+        if row.method == OURS
+        and row.motion == motion
+        and row.rate != NO_FRAMES
+        and not SETS[row.set_name].nothing_there
+        and not SETS[row.set_name].flicker
+    ]
+    wrong = _sweeps(row for row in shown if row.details.get("direction") == "receding")
+    unknown = _sweeps(row for row in shown if row.details.get("direction") == "unknown")
+    sweeps = _sweeps(shown)
+    return Verdict(
+        f"first direction wrong, {motion}: at most {allowed} of {TRIALS}",
+        OFFLINE,
+        sweeps,
+        TRIALS,
+        other=f"{wrong} wrong, {unknown} never decided, of {sweeps} sweeps that approach",
+        beside=beside,
+        verdict=direction_state(wrong, allowed, sweeps),
+    )
