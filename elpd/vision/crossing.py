@@ -62,7 +62,7 @@ UNANSWERED = 0.23
 
 TICKS = 64
 FEWEST_TICKS = 24
-LEVELS_AT_ONCE = 1 << 20
+LEVELS_AT_ONCE = 3 << 18
 """Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt, because a lens waits for them."""
 
 STILL_SHARE = 0.9
@@ -352,10 +352,13 @@ def without_lag(
         if biweight.sum() <= 0.0 or np.linalg.cond(normal) > 1e12:
             return mode, Lag()
         inverse = np.linalg.inv(normal)
+        before = focus, lag
         focus, lag = (float(one) for one in inverse @ (design.T @ (biweight * middle)))
         residual = middle - focus - lag * slowness
         scores = design * (biweight * residual)[:, None]
         covariance = inverse @ (scores.T @ scores) @ inverse
+        if abs(focus - before[0]) + abs(lag - before[1]) < 1e-6 * width:
+            break
     sigma_lag = float(np.sqrt(covariance[1, 1]))
     typical = float(np.average(slowness, weights=biweight))
     kept = lag**2 / (lag**2 + sigma_lag**2) if lag > 0.0 else 0.0

@@ -66,6 +66,7 @@ def band_gain(scale_px: float) -> float:
 
 
 def band_image(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
+    """Return one band of *image*: a difference of Gaussians, the inner of standard deviation *scale_px*."""
     band = cv2.GaussianBlur(image, (0, 0), scale_px)
     band -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
     return np.asarray(band, dtype=np.float32)

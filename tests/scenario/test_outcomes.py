@@ -151,8 +151,9 @@ def test_a_mechanism_that_is_stuck_in_the_light_is_told_from_darkness() -> None:
     assert_invariants(story)
 
 
-def test_a_coupling_that_slips_on_the_return_is_seen() -> None:
-    story = play("sim.seed=3", events=[Event("return", 0.0, _stick)])
+@pytest.mark.parametrize("after_ms", [0.0, 8.0])
+def test_a_coupling_that_slips_on_the_return_is_seen(after_ms: float) -> None:
+    story = play("sim.seed=3", events=[Event("return", after_ms, _stick)])
     assert story.outcome is Outcome.LENS_DID_NOT_MOVE
     assert_invariants(story)
 
@@ -177,3 +178,11 @@ def _darken(story: Story) -> None:
 
 def _stick(story: Story) -> None:
     story.truth.mechanism.stick(story.parts.clock.now_ns())
+
+
+def test_fine_texture_far_out_of_focus_does_not_turn_the_lens_round() -> None:
+    story = play("sim.seed=0", "sim.scene=brick", "sim.camera=davis346", "sim.speed_um_s=2000", small=False)
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert story.result.reversals == 0
+    assert_invariants(story)
