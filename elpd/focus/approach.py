@@ -28,9 +28,8 @@ AFTERGLOW_MS = 8.0
 TURN_MS = 5.0
 """A turn is over within this time of the command that makes it."""
 
-RETURN_SHARE = 0.25
-"""Blur is even in defocus: the way back to focus shows what the same stretch before focus showed on the way out. Pixels
-owe a threshold after a turn, so it makes 0.4 to 1.3 times as many events; a lens stuck beyond focus 0.1 to 0.15."""
+RETURN_SHARE = 0.5
+"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +137,11 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
     resting_hz, way_back_um = watch.resting_rate_hz, abs(from_um - focus_um)
     passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.back_from_us)) / NS_PER_S
     seen = watch.events_back - round(resting_hz * passed_s)
-    expected = watch.events_within(2 * focus_um - from_um, focus_um) - round(
-        resting_hz * way_back_um / settings.speed_um_s
-    )
+    expected = watch.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
         raise Ended(
             Outcome.LENS_DID_NOT_MOVE,
             f"the controller says that the lens went back {way_back_um:.0f} um, but the scene did not change "
-            f"({seen} events above noise, {expected} as far before focus); check the coupling between motor and lens",
+            f"({seen} events above noise, {expected} on the way out); check the coupling between motor and lens",
         )
     return seen

@@ -151,9 +151,8 @@ def test_a_mechanism_that_is_stuck_in_the_light_is_told_from_darkness() -> None:
     assert_invariants(story)
 
 
-@pytest.mark.parametrize("after_ms", [0.0, 8.0])
-def test_a_coupling_that_slips_on_the_return_is_seen(after_ms: float) -> None:
-    story = play("sim.seed=3", events=[Event("return", after_ms, _stick)])
+def test_a_coupling_that_slips_on_the_return_is_seen() -> None:
+    story = play("sim.seed=3", events=[Event("return", 0.0, _stick)])
     assert story.outcome is Outcome.LENS_DID_NOT_MOVE
     assert_invariants(story)
 
