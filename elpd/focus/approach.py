@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from elpd.records import CommandStamp, LensReport
 
 APPROACH_MARGIN_UM = 1.0
-"""How much further than the backlash the final approach begins: a step, and what a model of the motor may err by."""
+"""How much further than the backlash the final approach begins: what a motor's model may be wrong by, and a step."""
 
 BRAKING_SHARE = 0.25
 """Of the final approach's way: so close before the turn the lens brakes, and the next command needs the time left."""
+
+AFTERGLOW_MS = 8.0
+"""So long after a halt in mid-motion pixels still answer to what was before it, and the mechanics ring."""
 
 TURN_MS = 5.0
 """A turn is over within this time of the command that makes it."""
@@ -29,7 +32,7 @@ RETURN_SIGMAS = 6.0
 """Under a lamp, how certainly the way back must have undone what the way out had done."""
 
 RETURN_SHARE = 0.5
-"""The way back leads over the same ground as the way out, and beyond: half its events at the least."""
+"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +69,18 @@ class WayBack:
     others rest before every move.
     """
 
-    def __init__(self, stage: Stage, watch: Watch, settings: CycleSettings, sign: int) -> None:
+    def __init__(self, stage: Stage, settings: CycleSettings, sign: int) -> None:
         self._stage = stage
-        self._watch = watch
         self._sign = sign
         self._backlash_um = settings.backlash_um
         self._speed_um_s = stage.to_um(stage.parts.lens.limits.max_speed_sps)
         self._in_flight = stage.parts.lens.capabilities.native_velocity
         self._aim_um: float | None = None
-        self.begun_ns = stage.now_ns()
-        self.events_before = watch.events_in_cycle
-        """What had been counted when the lens set out."""
 
     def set_out(self, focus_um: float) -> None:
         """Send the lens past *focus_um*, as far as that is known yet. Does not wait."""
         aim_um = self._turn_um(focus_um)
-        if self._aim_um is None:
-            self.begun_ns, self.events_before = self._stage.now_ns(), self._watch.events_in_cycle
-        elif abs(aim_um - self._aim_um) < self._stage.um_per_step:
+        if self._aim_um is not None and abs(aim_um - self._aim_um) < self._stage.um_per_step:
             return
         self._aim_um = aim_um
         self._stage.send(aim_um, self._speed_um_s)
@@ -127,16 +124,7 @@ class WayBack:
         return self._stage.to_um(self._sign * lowest)
 
 
-def verify(
-    stage: Stage,
-    watch: Watch,
-    settings: CycleSettings,
-    way: WayBack,
-    rest: LensReport,
-    *,
-    focus_um: float,
-    stop_um: float,
-) -> int:
+def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport, focus_um: float) -> int:
     """See that the lens is where it was sent, and that the scene changed on the way: reports alone prove nothing.
 
     Returns the events above noise that the way back made. Raises ``Ended`` if either is not so.
@@ -148,11 +136,12 @@ def verify(
             f"the lens rests {error_um:+.1f} um from where it was sent; check the motor current and the mechanics",
         )
     stage.hear(safety.CAMERA_SILENCE_MS)
-    resting_hz, way_back_um = watch.resting_rate_hz, abs(stop_um - focus_um)
-    seen = watch.events_in_cycle - way.events_before
-    seen -= round(resting_hz * (stage.now_ns() - way.begun_ns) / NS_PER_S)
-    expected = watch.events_within(focus_um, stop_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     score = watch.return_score(focus_um)
+    from_um = stage.position_um(watch.back_from_us)
+    resting_hz, way_back_um = watch.resting_rate_hz, abs(from_um - focus_um)
+    passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.back_from_us)) / NS_PER_S
+    seen = watch.events_back - round(resting_hz * passed_s)
+    expected = watch.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if score is not None and score >= RETURN_SIGMAS:
         return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
 from elpd.focus import guards, safety
-from elpd.focus.approach import WayBack, standstill, verify
+from elpd.focus.approach import AFTERGLOW_MS, WayBack, standstill, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
@@ -162,15 +162,13 @@ class FocusCycle:
         passed = self._search(watch)
         self._phase(Phase.STOP)
         sign = self._details["sweep_sign"]
-        way = WayBack(self._stage, watch, self._settings, sign)
+        way = WayBack(self._stage, self._settings, sign)
         stop_um = self._come_to_rest(watch, passed, way, sign)
         estimate = self._judge(watch, sign, passed.begun_um, stop_um)
         self._phase(Phase.RETURN)
         rest = way.arrive(estimate.focus_um)
         self._phase(Phase.VERIFY)
-        self._details["return_events"] = verify(
-            self._stage, watch, self._settings, way, rest, focus_um=estimate.focus_um, stop_um=stop_um
-        )
+        self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
 
     def _picture(self) -> Picture:
@@ -293,9 +291,11 @@ class FocusCycle:
         watch.turn(stage.sensor_clock.to_sensor(ended_ns))
         if capabilities.abrupt_stop and capabilities.native_velocity:
             way.set_out(watch.roughly_um)
+            watch.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
             stage.hear(safety.CAMERA_SILENCE_MS)
         else:
             stage.rest(REST_LIMIT_MS)
+            watch.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
         ended = standstill(stage, watch, passed.stop, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
         return ended.um

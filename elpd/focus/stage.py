@@ -25,6 +25,12 @@ READ_TIMEOUT_S = 0.002
 REST_LIMIT_MS = 1500.0
 """No lens this is for rings or brakes longer; past it the lens does not obey."""
 
+SET_OUT_MS = 100.0
+"""A lens that was told to move and has not stirred for so long does not mean to."""
+
+REPORT_UM = 1.0
+"""Some controllers (GRBL) report micrometres, not steps."""
+
 SILENCE_MS = 200.0
 """Outside a sweep a camera may take this long to speak (bias changes, windows) before it counts as lost."""
 
@@ -108,7 +114,8 @@ class Stage:
     def rest(self, limit_ms: float, target: Steps | None = None) -> LensReport:
         """Wait until the lens rests; return the report that says so.
 
-        One report of no motion at *target* says so, or two in a row of no motion at the same place.
+        One report of no motion at *target* says so, or two in a row of no motion at the same place. Of a lens that was
+        sent elsewhere they must be so far apart that it is not just about to set out.
         Raises ``LensError`` if the lens is still moving after *limit_ms*.
         """
         deadline = after_ms(self.now_ns(), limit_ms)
@@ -119,10 +126,15 @@ class Stage:
             report = self.report
             if report is None or report is before or report.earliest_ns < asked_ns:
                 continue
-            there = target is not None and report.steps == target
-            if not report.moving and (there or (before is not None and report.steps == before.steps)):
+            if report.moving or before is None or report.steps != before.steps:
+                before = report
+            off_steps = 0.0 if target is None else abs(report.steps - target)
+            if not report.moving and target is not None and off_steps < 1.0:
                 return report
-            before = report
+            near = self.to_um(off_steps) < REPORT_UM
+            apart_ns = 0 if near else SET_OUT_MS * NS_PER_MS
+            if not report.moving and report is not before and report.earliest_ns - before.earliest_ns >= apart_ns:
+                return report
         where = "nowhere" if self.report is None else f"{self.to_um(self.report.steps):.1f} um"
         raise LensError(
             f"lens: not at rest within {limit_ms:.0f} ms (last report: {where}); "

@@ -71,7 +71,7 @@ UNANSWERED = 0.23
 
 TICKS = 64
 FEWEST_TICKS = 24
-LEVELS_AT_ONCE = 1 << 20
+LEVELS_AT_ONCE = 3 << 18
 """Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt, because a lens waits for them."""
 
 STILL_SHARE = 0.9
@@ -393,8 +393,8 @@ def _planes(
     if len(known) < 2 or len(known) < len(modes):
         return []
     shares = shares_of_planes(clusters, pairs.x[believed], pairs.y[believed], level.shape)
-    ticks = np.linspace(begin - width, end, TICKS)
-    tops = [float(ticks[int(np.argmax(_rebuilt_curve(events, ticks, peak, share)[0]))]) for share in shares]
+    ticks, groups = np.linspace(begin - width, end, TICKS), _by_pixel(events)
+    tops = [float(ticks[int(np.argmax(_rebuilt_curve(events, groups, ticks, share)))]) for share in shares]
     places = np.array([mode.at for mode in known])
     allowed = PLANES_AGREE * float(np.diff(places).min())
     # Each part must be sharpest where its pairs say, and the parts as far apart as the pairs.
@@ -424,10 +424,13 @@ def without_lag(
         if biweight.sum() <= 0.0 or np.linalg.cond(normal) > 1e12:
             return mode, Lag()
         inverse = np.linalg.inv(normal)
+        before = focus, lag
         focus, lag = (float(one) for one in inverse @ (design.T @ (biweight * middle)))
         residual = middle - focus - lag * slowness
         scores = design * (biweight * residual)[:, None]
         covariance = inverse @ (scores.T @ scores) @ inverse
+        if abs(focus - before[0]) + abs(lag - before[1]) < 1e-6 * width:
+            break
     sigma_lag = float(np.sqrt(covariance[1, 1]))
     typical = float(np.average(slowness, weights=biweight))
     kept = lag**2 / (lag**2 + sigma_lag**2) if lag > 0.0 else 0.0

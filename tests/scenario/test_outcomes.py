@@ -177,3 +177,11 @@ def _darken(story: Story) -> None:
 
 def _stick(story: Story) -> None:
     story.truth.mechanism.stick(story.parts.clock.now_ns())
+
+
+def test_fine_texture_far_out_of_focus_does_not_turn_the_lens_round() -> None:
+    story = play("sim.seed=0", "sim.scene=brick", "sim.camera=davis346", "sim.speed_um_s=2000", small=False)
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert story.result.reversals == 0
+    assert_invariants(story)
