@@ -133,7 +133,7 @@ def test_the_same_calls_give_the_same_bits() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "live_rms_um", "late_rms_um", "rest_um"),
-    [("tic", 0.1, 0.1, 0.1), ("grbl", 1.0, 0.4, 0.6), ("tmcl", 0.4, 0.3, 0.1)],
+    [("tic", 0.1, 0.1, 0.1), ("grbl", 1.0, 0.4, 0.6), ("tmcl", 0.4, 0.3, 0.1), ("zaber", 0.4, 0.3, 0.1)],
 )
 def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms_um: float, rest_um: float) -> None:
     assert kind in KINDS

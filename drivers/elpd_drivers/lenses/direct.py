@@ -312,10 +312,8 @@ class DirectLens:
             return
         if motor.stops_ignored > STOPS_TRIED:
             self._line.send(self._controller.last_resort)
-            raise Trouble(
-                f"the motor still runs at {report.velocity_sps or 0.0:.0f} steps/s after {STOPS_TRIED} stops; its "
-                "driver was switched off"
-            )
+            speed = "" if report.velocity_sps is None else f" at {report.velocity_sps:.0f} steps/s"
+            raise Trouble(f"the motor still runs{speed} after {STOPS_TRIED} stops; its driver was switched off")
         self._line.send(self._controller.stop_bytes[StopMode.ABRUPT])
 
     def _flagged(self, report: LensReport) -> LensReport:
