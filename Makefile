@@ -19,6 +19,7 @@ demo: install
 	@$(BIN)/elpd demo
 
 test: install
+	@tools/packages
 	@$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: install

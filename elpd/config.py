@@ -42,6 +42,8 @@ class LensSection(DeviceSection):
     """The lens and how to move it. Lengths on the motor's ruler."""
 
     um_per_step: Positive = 0.3125
+    steps_to_um: tuple[tuple[float, float], ...] = ()
+    """Rows of (steps, um) for a lens whose focus does not move in proportion to its motor; empty: it does."""
     speed_um_s: Positive = 4000.0
     backlash_um: Annotated[float, Field(ge=0)] = 6.0
     """Upper bound of the play between motor and carriage: the final approach overshoots by this much and a margin."""

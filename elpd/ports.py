@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Roi,
         StopMode,
     )
+    from elpd.scale import LensScale
     from elpd.units import HostNs, Steps
 
 
@@ -252,8 +253,13 @@ class RigParts:
     camera: EventCamera
     lens: Lens
     aperture: Aperture | None
-    um_per_step: float
+    scale: LensScale
     truth: Truth | None = None
+
+    @property
+    def um_per_step(self) -> float:
+        """The nominal length of a step; where it depends on the place, ``scale`` knows."""
+        return self.scale.um_per_step
 
 
 @dataclass(frozen=True, slots=True)

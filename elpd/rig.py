@@ -7,15 +7,19 @@ clock: a recording as the camera (``camera.driver = "file"``), a lens over a rea
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, DeviceError
 from elpd.ports import Closeable, RigParts
+from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from elpd.config import Config, DeviceSection, LensSection
     from elpd.ports import Aperture, Clock, EventCamera, Lens
 
@@ -58,11 +62,36 @@ def build(config: Config) -> RigParts:
             {
                 **config.sim.model_dump(),
                 "um_per_step": config.lens.um_per_step,
+                "steps_to_um": config.lens.steps_to_um,
             }
         )
     else:
         parts = _hardware(config)
     return _with_replacements(parts, config) if config.rig == "sim" else parts
+
+
+@contextmanager
+def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
+    """Open the lens that *config* describes, without a camera, and give it back at the end.
+
+    Raises what ``build`` raises.
+    """
+    if config.rig == "sim":
+        parts = build(config)
+        try:
+            yield parts.clock, parts.lens, parts.scale
+        finally:
+            release(parts)
+        return
+    if config.lens.driver == "sim":
+        raise ConfigError('lens.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    clock = MonotonicClock()
+    lens = _open_lens(config.lens, clock)
+    try:
+        yield clock, lens, _scale(config.lens)
+    finally:
+        if isinstance(lens, Closeable):
+            lens.close()
 
 
 def release(parts: RigParts) -> None:
@@ -85,7 +114,7 @@ def _hardware(config: Config) -> RigParts:
         if isinstance(lens, Closeable):
             lens.close()
         raise
-    return RigParts(clock, camera, lens, aperture, config.lens.um_per_step)
+    return RigParts(clock, camera, lens, aperture, _scale(config.lens))
 
 
 def _with_replacements(parts: RigParts, config: Config) -> RigParts:
@@ -107,8 +136,17 @@ def _open(group: str, section: DeviceSection, clock: Clock) -> EventCamera:
 
 def _open_lens(section: LensSection, clock: Clock) -> Lens:
     settings = {**section.settings(), "um_per_step": section.um_per_step, "max_speed_um_s": section.speed_um_s}
+    scale = _scale(section)
+    if scale.table:  # a driver knows steps of one nominal size: say where the ends are in those
+        for key in ("min_um", "max_um"):
+            if isinstance(settings.get(key), (int, float)):
+                settings[key] = scale.to_steps(settings[key]) * section.um_per_step
     lens: Lens = find("elpd.lenses", section.driver)(settings, clock)
     return lens
+
+
+def _scale(section: LensSection) -> LensScale:
+    return LensScale(section.um_per_step, section.steps_to_um)
 
 
 def _open_aperture(section: DeviceSection, clock: Clock) -> Aperture:

@@ -19,6 +19,7 @@ from elpd.records import (
     PositionEstimate,
     StopMode,
 )
+from elpd.scale import LensScale
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -103,7 +104,7 @@ def scripted_rig(
         camera=camera(script),
         lens=lens(script),
         aperture=None if aperture is None else aperture(script),
-        um_per_step=0.3125,
+        scale=LensScale(0.3125),
     )
 
 

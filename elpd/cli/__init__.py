@@ -25,8 +25,12 @@ COMMANDS = {
     "detect": "the causal detector over a recorded sweep",
     "expose": "stage 1 alone: open the aperture, make the map",
     "focus": "one focus cycle",
+    "home": "find the lens's reference",
+    "jog": "move the lens by so much",
+    "move": "move the lens to a place",
     "replay": "run a recorded cycle again, to the same decision",
     "sim-board": "a simulated lens controller on a pty",
+    "stop": "stop the lens now",
     "temporal-map": "an HDR picture from a recorded aperture opening",
 }
 

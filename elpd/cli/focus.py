@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from elpd.cli.common import config_options, interruptible, json_option, parse_roi, print_json
+from elpd.cli.common import config_options, from_here, interruptible, json_option, parse_roi, print_json
 from elpd.config import Config, load
-from elpd.errors import BusyError, UsageError
+from elpd.errors import UsageError
 from elpd.focus.settings import FocusRequest
 from elpd.records import Roi
 
@@ -34,11 +34,7 @@ def command(
     as_json: bool,
 ) -> int:
     """Focus once: exit 0 in focus, 1 not found, 2 usage, 3 device, 4 busy or unreachable."""
-    if not (foreground or config_path or overrides):
-        raise BusyError(
-            "no daemon answers; start one, or focus from this process with --foreground (the simulated rig), "
-            "--config FILE or --set KEY=VALUE"
-        )
+    from_here(foreground=foreground, config_path=config_path, overrides=overrides)
     config = load(config_path, overrides)
     request = FocusRequest(
         roi=parse_roi(roi) or _configured_roi(config),

@@ -73,7 +73,7 @@ def focus_on(
 ) -> Session:
     """Run one whole cycle on a rig that stays the caller's; raises what ``focus_once`` raises."""
     if request.reference is not None and request.reference.suffix == ".npz":
-        here_um = parts.lens.position_at(parts.clock.now_ns()).steps * parts.um_per_step
+        here_um = parts.scale.to_um(parts.lens.position_at(parts.clock.now_ns()).steps)
         depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um
         stored_map.load(request.reference).check(parts.camera.geometry, here_um, depth_of_focus_um, time.time())
     with RunWriter.begin(config, request, parts) as run:

@@ -186,7 +186,7 @@ class Search:
         if self._settings.first_direction != "auto":
             return 1 if self._settings.first_direction == "up" else -1
         limits = self._lens.limits
-        here = self._stage.here_um() / self._stage.um_per_step
+        here = self._lens.position_at(self._stage.now_ns()).steps
         return 1 if limits.max_steps - here >= here - limits.min_steps else -1
 
     def _braking_um(self, speed_um_s: float) -> float:
@@ -195,5 +195,5 @@ class Search:
         onset_ms = capabilities.stop_onset_ms + 2 * capabilities.stop_onset_sigma_ms
         ramp_um = 0.0
         if not capabilities.abrupt_stop:
-            ramp_um = speed_um_s**2 / (2 * self._stage.to_um(limits.acceleration_sps2))
+            ramp_um = speed_um_s**2 / (2 * limits.acceleration_sps2 * self._stage.um_per_step)
         return speed_um_s * onset_ms / 1000.0 + ramp_um

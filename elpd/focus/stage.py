@@ -34,7 +34,7 @@ class Stage:
 
     def __init__(self, parts: RigParts) -> None:
         self.parts = parts
-        self.um_per_step = parts.um_per_step
+        self.scale = parts.scale
         latency_us = parts.camera.min_latency_us if isinstance(parts.camera, Latency) else 0.0
         self.sensor_clock = SensorClock(latency_us)
         self.frame: Frame | None = None
@@ -55,11 +55,16 @@ class Stage:
 
     def to_um(self, steps: float) -> float:
         """Convert steps to um on the motor's ruler."""
-        return steps * self.um_per_step
+        return self.scale.to_um(steps)
 
     def to_steps(self, um: float) -> Steps:
         """Convert um on the motor's ruler to the nearest step."""
-        return Steps(round(um / self.um_per_step))
+        return self.scale.to_steps(um)
+
+    @property
+    def um_per_step(self) -> float:
+        """How long a step is where the motor is now."""
+        return self.scale.um_per_step_at(self.here_um()) if self.scale.table else self.scale.um_per_step
 
     def position_um(self, when: SensorUs) -> float:
         """Return where the motor was at a sensor time."""

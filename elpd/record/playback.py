@@ -319,6 +319,7 @@ def _facts(line: dict[str, Any]) -> RigFacts:
         ),
         capabilities=records.LensCapabilities(**{name: number(value) for name, value in capabilities.items()}),
         um_per_step=number(line["um_per_step"]),
+        steps_to_um=tuple((number(steps), number(um)) for steps, um in line.get("steps_to_um", ())),
         opening_ms=number(line["opening_ms"]),
         min_latency_us=number(line["min_latency_us"]),
         abilities={device: tuple(names) for device, names in line["abilities"].items()},

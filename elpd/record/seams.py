@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask, RigParts
+from elpd.scale import LensScale
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -57,6 +58,7 @@ class RigFacts:
     limits: LensLimits
     capabilities: LensCapabilities
     um_per_step: float
+    steps_to_um: tuple[tuple[float, float], ...]
     opening_ms: float | None
     min_latency_us: float | None
     abilities: dict[str, tuple[str, ...]]
@@ -70,6 +72,7 @@ class RigFacts:
             limits=parts.lens.limits,
             capabilities=parts.lens.capabilities,
             um_per_step=parts.um_per_step,
+            steps_to_um=parts.scale.table,
             opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
             min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
             abilities={
@@ -92,7 +95,7 @@ def build_doubles(facts: RigFacts, channel: Channel) -> RigParts:
         camera=cast("EventCamera", make("camera", _CameraDouble)),
         lens=cast("Lens", make("lens", _LensDouble)),
         aperture=None if facts.opening_ms is None else cast("Aperture", make("aperture", _ApertureDouble)),
-        um_per_step=facts.um_per_step,
+        scale=LensScale(facts.um_per_step, facts.steps_to_um),
     )
 
 

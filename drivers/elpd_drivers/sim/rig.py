@@ -20,6 +20,7 @@ from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
 from elpd.records import Encoding, Geometry, Roi
+from elpd.scale import LensScale
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, SimulatedCamera, Wire
@@ -57,7 +58,8 @@ class SimSettings:
     pictures by seed. ``speed_um_s`` is what the sweep is meant to run at; the lens allows three times as much.
     ``width`` and ``height`` shrink the sensor; 0 is the camera's own size. Rates are per pixel; ``brightness`` scales
     the light, and with it photoreceptor lag and shot noise. The ``camera_*``, ``drop_*`` and ``aperture_stuck`` or
-    ``_slow`` keys inject faults, in seconds after the camera's start.
+    ``_slow`` keys inject faults, in seconds after the camera's start. ``cam`` makes the image move by 1 ± that many
+    times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner believes in.
     """
 
     seed: int = 0
@@ -93,6 +95,8 @@ class SimSettings:
     # lens
     travel_um: float = 2500.0
     um_per_step: float = 0.3125
+    steps_to_um: tuple[tuple[float, float], ...] = ()
+    cam: float = 0.0
     backlash_um: float = 4.0
     acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
@@ -118,6 +122,22 @@ class Evt3Wire:
         return np.concatenate([words, self._encoder.encode_time(end_us)])
 
 
+@dataclass(frozen=True, slots=True)
+class Cam:
+    """What a lens with a cam does to the carriage's travel: the image moves by ``1 ± unevenness`` times as much.
+
+    ``unevenness`` is the largest relative departure from one (0: a plain screw), one wave over the travel.
+    """
+
+    unevenness: float
+    travel_um: float
+
+    def image_um(self, carriage_um: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+        """Return how far the image has moved, um, where the carriage is at *carriage_um* (any shape)."""
+        wave = 2 * np.pi / self.travel_um
+        return np.asarray(carriage_um + self.unevenness / wave * np.sin(wave * carriage_um))
+
+
 class SimulatedTruth:
     """What only a simulated rig knows (``elpd.ports.Truth``), and its parts, for tests that reach in.
 
@@ -139,6 +159,8 @@ class SimulatedTruth:
         scene: str,
         light: LightField,
         geometry: Geometry,
+        cam: Cam,
+        scale: LensScale,
     ) -> None:
         self.world = world
         self.mechanism = mechanism
@@ -149,6 +171,8 @@ class SimulatedTruth:
         self._lens = lens
         self._light = light
         self._geometry = geometry
+        self._cam = cam
+        self._scale = scale
 
     def picture(self) -> NDArray[np.float32]:
         """Return what falls on the sensor now, behind an open aperture: log photocurrent, (height, width)."""
@@ -160,7 +184,11 @@ class SimulatedTruth:
     def carriage_error_um(self) -> float:
         """Return how far the carriage is from focus now, signed."""
         now = np.array([self.world.now_ns()], np.int64)
-        return float(self.mechanism.carriage_um(now)[0]) - self.focus_carriage_um
+        here_um, focus_um = (
+            self._cam.image_um(self.mechanism.carriage_um(now)),
+            self._cam.image_um(np.float64(self.focus_carriage_um)),
+        )
+        return float(here_um[0] - focus_um)
 
     def focus_um(self, sweep_sign: int) -> float | None:
         """Return focus on the motor's ruler while the carriage is pushed in a direction (+1, -1; 0: mid-play).
@@ -174,8 +202,9 @@ class SimulatedTruth:
         except LensError:
             return None
         mechanics = self.mechanism.mechanics
-        shift_um = round(count - self.mechanism.rotor_at(now)) * mechanics.um_per_step
-        return self.focus_carriage_um + sweep_sign * mechanics.backlash_um / 2 + shift_um
+        rotor_um = self.focus_carriage_um + sweep_sign * mechanics.backlash_um / 2
+        shift = round(count - self.mechanism.rotor_at(now))
+        return self._scale.to_um(rotor_um / mechanics.um_per_step + shift)
 
     def errors(self, result: FocusResult) -> dict[str, float | None]:
         """Return ``focus_um estimate_error_um stop_error_um final_error_um``; ``None`` where there is no number."""
@@ -199,6 +228,8 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     """
     chosen = read_settings(SimSettings, settings, "sim")
     geometry = _geometry(chosen)
+    scale = LensScale(chosen.um_per_step, chosen.steps_to_um)
+    cam = Cam(chosen.cam, chosen.travel_um)
     seed = chosen.seed
     world = World(chosen.pace)
     focus_um, start_um = _place(chosen)
@@ -208,8 +239,8 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
     light = LightField(
         DefocusStack(scene_canvas(scene, geometry.width, geometry.height, MARGIN_PX), chosen.brightness),
-        mechanism.carriage_um,
-        focus_um,
+        lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)),
+        float(cam.image_um(np.float64(focus_um))),
         SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX),
         aperture=aperture,
         depth_of_focus_um=chosen.depth_of_focus_um,
@@ -228,8 +259,10 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         scene=scene,
         light=light,
         geometry=geometry,
+        cam=cam,
+        scale=scale,
     )
-    return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, chosen.um_per_step, truth)
+    return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, scale, truth)
 
 
 def _geometry(chosen: SimSettings) -> Geometry:
