@@ -283,6 +283,8 @@ def test_what_was_unplugged_and_plugged_in_again_can_be_opened_and_used(kind: st
 
 def test_an_alarm_in_motion_is_a_fault_from_which_homing_recovers(kind: str) -> None:
     made = open_rig(kind)
+    if not hasattr(made.board, "alarm_at"):
+        pytest.skip("the controller has no alarm but its limit switches")
     made.lens.run(SPEED_SPS, made.soon(3000))
     made.live(40)
     made.board.alarm_at(made.clock.now_ns())

@@ -199,7 +199,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["marlin"], "known are grbl, tic, tmcl, zaber"),
+        (["marlin"], "known are avr, grbl, tic, tmcl, zaber"),
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),

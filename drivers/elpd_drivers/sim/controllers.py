@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import grbl, tic, tmcl, zaber
+from elpd_drivers.lenses import avr, grbl, tic, tmcl, zaber
+from elpd_drivers.lenses.avr_wire import FASTEST_SPS
+from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
 from elpd_drivers.sim.boards.tic import BOARD as TIC
@@ -67,12 +69,19 @@ def _set_up(wanted: Wanted) -> Table:
     return {"speed_um_s": wanted.speed_um_s, "acceleration_um_s2": wanted.acceleration_um_s2}
 
 
+def _as_fast_as_an_avr(wanted: Wanted) -> Table:
+    """Return the same, at no more than our own controller's fastest."""
+    fastest_um_s = FASTEST_SPS * wanted.um_per_step
+    return {**_told_by_driver(wanted), "max_speed_um_s": min(wanted.speed_um_s, fastest_um_s)}
+
+
 CONTROLLERS: Mapping[str, Controller] = {
     "tic": Controller(TIC, tic.open_lens, _nothing, _told_by_driver),
     "grbl": Controller(
         GRBL, grbl.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step, "trust_position": True}
     ),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
+    "avr": Controller(AVR, avr.open_lens, _nothing, _as_fast_as_an_avr),
     "zaber": Controller(ZABER, zaber.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step}),
 }
 

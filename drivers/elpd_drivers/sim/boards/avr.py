@@ -12,24 +12,19 @@ import hashlib
 import os
 import shutil
 import subprocess
-import time
 from collections import deque
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from elpd.errors import LensError
 from elpd.motion.kinematics import Piece
 from elpd.units import NS_PER_MS, NS_PER_S
 from elpd_drivers.lenses import avr_wire as wire
-from elpd_drivers.sim.boards.line import PtyServer
-from elpd_drivers.sim.boards.settings import lens_and_config
+from elpd_drivers.sim.boards.served import ServedBoard
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from elpd.ports import RunningBoard
     from elpd_drivers.sim.lens import SimulatedLens
 
 FIRMWARE = Path(__file__).parents[3] / "firmware"
@@ -262,13 +257,4 @@ def load_bench() -> ctypes.CDLL:
     return bench
 
 
-class _Board:
-    """The entry point ``elpd.boards: avr``."""
-
-    def serve(self, settings: Mapping[str, Any]) -> RunningBoard:
-        """Serve the firmware in front of a lens; see ``boards.settings`` for the keys."""
-        lens, config, seed = lens_and_config(settings, AvrConfig)
-        return PtyServer(AvrBoard(lens, config, seed=seed, begin_ns=time.monotonic_ns()))
-
-
-BOARD = _Board()
+BOARD = ServedBoard(AvrBoard, AvrConfig)
