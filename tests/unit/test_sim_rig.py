@@ -137,8 +137,8 @@ def test_the_davis_has_frames_and_arrays_and_no_aperture() -> None:
     assert frames == 3
 
 
-@pytest.mark.parametrize("board", ["tic", "grbl"])
-def test_both_boards_turn_the_lens(board: str) -> None:
+@pytest.mark.parametrize("board", ["tic", "grbl", "tmcl", "zaber"])
+def test_every_board_turns_the_lens(board: str) -> None:
     rig = build_rig(SMALL | {"seed": 1, "board": board})
     truth = _truth(rig)
     rig.lens.run(4000 / rig.um_per_step, HostNs(rig.clock.now_ns() + 150_000_000))
