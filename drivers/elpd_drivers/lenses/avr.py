@@ -215,12 +215,13 @@ class AvrController:
         )
         return Going(sent.begun_ns, sent.done_ns, [(sent.off_wire_ns, motion)])
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
         """Let what was not obeyed yet be forgotten; a halt from too high a speed costs steps, and the reference."""
         del sent
         self._unconfirmed = None
         if mode is StopMode.ABRUPT and speed_sps * self._settings.um_per_step > self._settings.start_stop_um_s:
             self._motor.referenced = False
+        return 0
 
     # --- homing ----------------------------------------------------------------------------------------------------
 

@@ -188,8 +188,10 @@ class TmclController:
         else:
             steps = [(limit, None), (aim, motion)]
         planned: list[tuple[int, Motion]] = []
-        done = begun
+        done, stops = begun, self._motor.stops
         for command, then in steps:
+            if self._motor.stops != stops:
+                break  # one came while the first reply was awaited
             sent = self._line.send(self._talk.frame(*command))
             self._talk.confirm(command[0])
             done = sent.done_ns
@@ -198,11 +200,15 @@ class TmclController:
         self._speed_units = units
         return Going(begun, done, planned)
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
-        """Remember that an acknowledgement is due."""
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
+        """Remember that an acknowledgement is due; the module may finish the reply before it first."""
         del mode, speed_sps
         self._talk.stops_open += 1
         self._stop_first_ns = self._stop_sent_ns = sent.off_wire_ns
+        if self._waiting is None:
+            return 0
+        reply_out_ns = self._asked_off_ns + self._latency.usual_ns + wire.FRAME * self._line.byte_ns
+        return max(0, reply_out_ns - sent.off_wire_ns)
 
     def _repeat_stop(self, now_ns: int) -> None:
         """Send an unacknowledged stop again, when its reply and the one before it should have come."""

@@ -266,11 +266,12 @@ class ZaberController:
         motion = Motion(self.limits.acceleration_sps2, target_steps=float(target), speed_sps=units / wire.SPEED_PER_SPS)
         return Going(sent.begun_ns, sent.done_ns, [(sent.off_wire_ns, motion)])
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
         """Distrust the position after an abrupt stop in motion."""
         del sent
         if mode is StopMode.ABRUPT and speed_sps > 0.0:
             self._motor.referenced = False
+        return 0
 
     # --- homing ----------------------------------------------------------------------------------------------------
 
