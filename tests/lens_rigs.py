@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from elpd_drivers.lenses import avr_wire
-from elpd_drivers.sim.boards.avr import load_bench
+from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
 from elpd_drivers.sim.lens import SimulatedLens
 from virtual import MonotonicClock, TestClock
 
-from elpd.errors import LensError
 from elpd.units import HostNs
 
 if TYPE_CHECKING:
@@ -23,6 +22,22 @@ if TYPE_CHECKING:
 KINDS = tuple(CONTROLLERS)
 UM_PER_STEP = 0.3125
 SPEED_SPS = 12_800.0  # 4 mm/s
+
+
+def _avr_lie(data: bytes) -> bytes:
+    """Put the position at the start (3200, no byte of it escaped) elsewhere, under a right CRC."""
+    if (3200).to_bytes(4, "little") not in data:
+        return data
+    body = bytearray()
+    escaped = False
+    for byte in data[1:-1]:
+        if byte == 0xFD:
+            escaped = True
+            continue
+        body.append(byte ^ 0x20 if escaped else byte)
+        escaped = False
+    sequence, command = body[0], body[1]
+    return avr_wire.encode(sequence, command, bytes(body[2:5]) + (900).to_bytes(4, "little") + bytes(body[9:-2]))
 
 
 def _tmcl_lie(data: bytes) -> bytes:
@@ -76,6 +91,14 @@ DIALECTS = {
         spoil=None,
         settings={"trust_position": True},
     ),
+    "avr": Dialect(
+        2.0,
+        abrupt_keeps_reference=True,
+        moves=lambda data: data[:1] == b"\xfe" and data[2] == avr_wire.GO,
+        lie=_avr_lie,
+        question=avr_wire.encode(9, avr_wire.STATUS),
+        spoil=lambda data: bytes((*data[:7], data[7] ^ 4, *data[8:])),
+    ),
     "tmcl": Dialect(
         RAMP_MS + 6.0,
         abrupt_keeps_reference=True,
@@ -101,36 +124,6 @@ DIALECTS["zaber"] = Dialect(
     lie=_zaber_lie,
     question=b"/1 1 07 get pos",
     spoil=lambda data: data.replace(b" OK ", b" OJ ") if data.startswith(b"@") else data,
-)
-
-
-class _AvrLie:
-    """The firmware sends byte by byte, so a lie waits until its frame is whole."""
-
-    def __init__(self) -> None:
-        self._frame = b""
-
-    def __call__(self, data: bytes) -> bytes:
-        self._frame = data if data == b"\xfe" else self._frame + data
-        if not data.endswith(b"\xff"):
-            return b""
-        raw = bytearray()
-        for byte in self._frame[1:-1]:
-            if raw and raw[-1] == 0xFD:
-                raw[-1] = byte ^ 0x20
-            else:
-                raw.append(byte)
-        sequence, command, payload = raw[0], raw[1], bytes(raw[2:-2])
-        return avr_wire.encode(sequence, command, payload.replace(b"\x80\x0c\0\0", b"\x84\x03\0\0"))
-
-
-DIALECTS["avr"] = Dialect(
-    2.0,
-    abrupt_keeps_reference=True,
-    moves=lambda data: data[2:3] == bytes((avr_wire.GO,)),
-    lie=_AvrLie(),
-    question=avr_wire.encode(9, avr_wire.STATUS),
-    spoil=lambda data: bytes(byte ^ 4 if byte < 0xF0 else byte for byte in data),
 )
 
 
@@ -191,9 +184,15 @@ class Rig:
         return self.motor.motor_steps(np.array(times_ns, dtype=np.int64))
 
 
+def _skip_what_cannot_be_built(kind: str) -> None:
+    hindrance = avr_board.hindrance() if kind == "avr" else None
+    if hindrance is not None:
+        pytest.skip(hindrance)
+
+
 def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool = True, **config: Any) -> Rig:
     """Make a rig in virtual time; ``open`` connects the driver."""
-    _needs_parts(kind)
+    _skip_what_cannot_be_built(kind)
     clock = TestClock()
     motor = SimulatedLens(start_um=start_um)
     kinds = CONTROLLERS[kind].board
@@ -201,15 +200,6 @@ def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool 
     port = MemoryPort(board, clock)
     clock.actors.append(port)
     return Rig(kind, clock, motor, board, port)
-
-
-def _needs_parts(kind: str) -> None:
-    """Skip what cannot be built here: the firmware needs a cross-compiler and simavr (tools/packages)."""
-    if kind == "avr":
-        try:
-            load_bench()
-        except LensError as error:
-            pytest.skip(str(error))
 
 
 def open_rig(kind: str, **kwargs: Any) -> Rig:
@@ -221,7 +211,7 @@ def open_rig(kind: str, **kwargs: Any) -> Rig:
 
 def served(kind: str, clock: MonotonicClock, **config: Any) -> tuple[PtyServer, SimulatedLens]:
     """Serve a board on a pty."""
-    _needs_parts(kind)
+    _skip_what_cannot_be_built(kind)
     motor = SimulatedLens(start_um=1000.0)
     kinds = CONTROLLERS[kind].board
     config = kinds.config(referenced=True, **config)

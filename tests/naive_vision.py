@@ -38,6 +38,17 @@ def sum_windows(t_us: Any, x: Any, y: Any, on: Any, weights: Any, region: Any, e
     return rows
 
 
+def stamp_events(events: Any, stamp: Any, height: Any, width: Any) -> Any:
+    band = [[0.0] * width for _ in range(height)]
+    reach = len(stamp) // 2
+    for x, y, on in events:
+        for row in range(-reach, reach + 1):
+            for column in range(-reach, reach + 1):
+                if 0 <= y + row < height and 0 <= x + column < width:
+                    band[y + row][x + column] += (1 if on else -1) * stamp[row + reach][column + reach]
+    return band
+
+
 def mirror_pairs(t_us: Any, x: Any, y: Any, on: Any, position: Any) -> Any:
     """Return (before, after, t, x, y, on) of each opposite event that follows two equal ones of its pixel."""
     history = defaultdict(list)

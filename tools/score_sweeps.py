@@ -2,8 +2,11 @@
 
     python tools/score_sweeps.py ../shared/sweeps [--only static] [-- OPTIONS OF elpd detect]
 
-Each sub-folder holds a sweep and ``truth.json`` (``gt_us`` or null, ``um_per_us``); the detector is started as a
-program of its own and sees the options after ``--`` and the sweep, never the truth.
+Each sub-folder holds a sweep and ``truth.json``: ``gt_us`` (or null), ``um_per_us``, and, where they apply,
+``must_fail`` (no focus in it), ``may_miss`` (so hard that no answer is no fault), ``dof_um`` and ``aperture_open_s``.
+The detector is started as a program of its own and sees the options after ``--`` and the sweep, never the truth. Two
+options are completed for each sweep: the word FIRST becomes the path of its first frame, PATH that of its
+``lens_path.csv``.
 """
 
 from __future__ import annotations
@@ -17,6 +20,10 @@ from pathlib import Path
 from typing import Any
 
 DEPTH_OF_FOCUS_UM = 16.0
+HONEST_SIGMAS = 3.0
+"""An error of more standard deviations than this makes the stated one untrue."""
+
+FAULTS = ("miss", "OUTSIDE", "FALSE", "early")
 
 
 def main() -> int:
@@ -47,33 +54,47 @@ def main() -> int:
 def score(case: Path, options: list[str]) -> dict[str, Any]:
     """Run the detector over one sweep and compare."""
     truth = json.loads((case / "truth.json").read_text())
-    more = [first_frame(case) if one == "FIRST" else one for one in options]
-    if truth.get("aperture_open_s") and "--aperture-us" not in more:
-        opened_us = round(truth["aperture_open_s"][0] * 1e6)
-        more += ["--aperture-us", f"0,{opened_us}", "--transmittance", "linear", "--frames", "none"]
     started = time.perf_counter()
     run = subprocess.run(  # noqa: S603  (our own program)
-        [sys.executable, "-c", "from elpd.cli import main; main()", "detect", str(case), "--json", *more],
+        [sys.executable, "-c", "from elpd.cli import main; main()", "detect", *arguments_for(case, truth, options)],
         capture_output=True,
         text=True,
         check=False,
     )
+    seconds = time.perf_counter() - started
     answer = json.loads(run.stdout) if run.stdout.strip() else {"outcome": f"crashed: {run.stderr[-300:]}"}
+    return {**compare(case.name, truth, answer), "seconds": seconds}
+
+
+def arguments_for(case: Path, truth: dict[str, Any], options: list[str]) -> list[str]:
+    """Return what `elpd detect` is told about a sweep: its path, the options, when an aperture opened."""
+    words = {"FIRST": lambda: first_frame(case), "PATH": lambda: str(case / "lens_path.csv")}
+    more = [words[one]() if one in words else one for one in options]
+    if truth.get("aperture_open_s") and "--aperture-us" not in more:
+        opened_us = round(truth["aperture_open_s"][0] * 1e6)
+        more += ["--aperture-us", f"0,{opened_us}", "--transmittance", truth.get("transmittance", "linear")]
+        more += [] if "--frames" in more else ["--frames", "none"]
+    return [str(case), "--json", *more]
+
+
+def compare(name: str, truth: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
+    """Compare an answer of the detector with the truth."""
     um_per_us = truth.get("um_per_us") or truth.get("um_per_us_at_gt") or 0.0008
-    truth_us = None if truth.get("must_fail") else truth.get("gt_us")
+    truth_us = None if truth.get("must_fail") else truth.get("gt_us") or None
     found = answer.get("focus_us") if answer.get("outcome") == "FOCUSED" else None
     error_um = None if found is None or truth_us is None else (found - truth_us) * um_per_us
+    decided_um = late(answer.get("decided_us"), truth_us, um_per_us)
     return {
-        "case": case.name,
+        "case": name,
+        "motion": str(truth.get("motion") or "static").removesuffix("_f"),
         "outcome": answer.get("outcome"),
         "direction": answer.get("direction"),
         "error_um": error_um,
         "sigma_um": None if answer.get("sigma_us") is None else answer["sigma_us"] * um_per_us,
-        "decided_um": late(answer.get("decided_us"), truth_us, um_per_us),
+        "decided_um": decided_um,
         "crossing_um": late(answer.get("elp_crossing_us"), truth_us, um_per_us),
         "method": answer.get("method"),
-        "verdict": verdict(truth_us, answer.get("outcome"), error_um),
-        "seconds": time.perf_counter() - started,
+        "verdict": verdict(truth, truth_us, answer.get("outcome"), error_um, decided_um),
         "contributions": answer.get("contributions"),
         "error": answer.get("error"),
     }
@@ -89,13 +110,22 @@ def late(t_us: int | None, truth_us: int | None, um_per_us: float) -> float | No
     return None if t_us is None or truth_us is None else (t_us - truth_us) * um_per_us
 
 
-def verdict(truth_us: int | None, outcome: str | None, error_um: float | None) -> str:
-    """Name the case: right, missed, outside a depth of focus, or a focus where there is none."""
+def verdict(
+    truth: dict[str, Any],
+    truth_us: int | None,
+    outcome: str | None,
+    error_um: float | None,
+    decided_um: float | None,
+) -> str:
+    """Name the case: right, missed, outside a depth of focus, early, or a focus where there is none."""
     if outcome != "FOCUSED":
-        return "ok" if truth_us is None or truth_us == 0 else "miss"
+        return "ok" if truth_us is None else "(miss)" if truth.get("may_miss") else "miss"
     if error_um is None:
         return "FALSE"
-    return "ok" if abs(error_um) <= DEPTH_OF_FOCUS_UM else "OUTSIDE"
+    depth_um = truth.get("dof_um") or DEPTH_OF_FOCUS_UM
+    if abs(error_um) > depth_um:
+        return "OUTSIDE"
+    return "early" if decided_um is not None and decided_um < -depth_um else "ok"
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
@@ -114,15 +144,21 @@ def print_table(rows: list[dict[str, Any]]) -> None:
 
 
 def print_summary(rows: list[dict[str, Any]]) -> None:
-    """Print mean, worst, misses and false answers, for static sweeps and for all."""
-    for name, chosen in (("static", [row for row in rows if row["case"].endswith("static")]), ("all", rows)):
-        errors = [abs(row["error_um"]) for row in chosen if row["error_um"] is not None]
-        counts = {word: sum(row["verdict"] == word for row in chosen) for word in ("miss", "OUTSIDE", "FALSE")}
-        if errors:
-            mean, worst = sum(errors) / len(errors), max(errors)
-            print(f"{name}: n {len(errors)}, mean |error| {mean:.2f} um, worst {worst:.2f} um, {counts}")
-        else:
+    """Print mean, bias, worst, and how often the stated error was untrue, for each kind of motion and for all."""
+    kinds = sorted({row["motion"] for row in rows})
+    for name, chosen in [*((kind, [row for row in rows if row["motion"] == kind]) for kind in kinds), ("all", rows)]:
+        known = [row for row in chosen if row["error_um"] is not None]
+        counts = {word: sum(row["verdict"] == word for row in chosen) for word in FAULTS}
+        if not known:
             print(f"{name}: no answers, {counts}")
+            continue
+        errors = [row["error_um"] for row in known]
+        untrue = sum(abs(row["error_um"]) > HONEST_SIGMAS * row["sigma_um"] for row in known if row["sigma_um"])
+        print(
+            f"{name}: n {len(errors)}, mean |error| {sum(map(abs, errors)) / len(errors):.2f} um, "
+            f"bias {sum(errors) / len(errors):+.2f}, worst {max(map(abs, errors)):.2f} um, "
+            f"beyond {HONEST_SIGMAS:.0f} sigma {untrue}, {counts}"
+        )
 
 
 if __name__ == "__main__":

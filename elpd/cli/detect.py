@@ -11,13 +11,15 @@ import click
 import numpy as np
 
 from elpd.cli.common import config_options, json_option, parse_interval_us, parse_roi, print_json
+from elpd.cli.replay import run_cycle
 from elpd.config import load
 from elpd.errors import FormatError, UsageError
 from elpd.focus.picture import Picture
 from elpd.record.journal import is_run
 from elpd.record.layouts import read_sweep
 from elpd.record.paper_sweep import detect_as_published
-from elpd.record.run_sweep import read_run_sweep
+from elpd.record.replay import load_run, replay_run
+from elpd.record.run_sweep import found_live, read_run_sweep
 from elpd.record.sweep_file import Detection, SweepSearch
 from elpd.records import Direction, Geometry, Outcome
 from elpd.units import SensorUs
@@ -28,6 +30,7 @@ from elpd.vision.ruler import Ruler
 from elpd.vision.temporal_map import quality, read_transmittance, temporal_image
 
 if TYPE_CHECKING:
+    from elpd.record.run_sweep import RunSweep
     from elpd.records import TemporalImage
 
 
@@ -72,11 +75,17 @@ def command(
     given = None if reference_path is None else read_picture(reference_path)
     size = None if given is None else Geometry(given.pixels.shape[1], given.pixels.shape[0])
     recorded = read_run_sweep(path) if is_run(path) else None
+    as_recorded = not any((roi, frames, reference_path, aperture_us, speed_um_s, lens_path, dof_um, method == "paper"))
+    if recorded is not None and as_recorded:
+        found = _run_again(path, recorded)
+        if found is not None:
+            return _finish(found, as_json=as_json)
     if recorded is None:
         sweep = read_sweep(path, frames=frames, size=size)
     else:
         sweep = replace(recorded.sweep, frames=()) if frames == "none" else recorded.sweep
         aperture_us = aperture_us or recorded.aperture_us
+        dof_um = dof_um or load_run(path).config["focus"]["depth_of_focus_um"]
         if speed_um_s is None and lens_path is None:
             ruler = Ruler.of_path(recorded.path_t_us, recorded.path_um)
     for warning in sweep.warnings:
@@ -111,6 +120,12 @@ def command(
         return _finish(found, as_json=as_json)
     search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)
     return _finish(search.run(), as_json=as_json)
+
+
+def _run_again(path: Path, recorded: RunSweep) -> Detection | None:
+    """Run a recorded cycle again; what it found, if that is what it found then and it is a focus."""
+    report = replay_run(load_run(path), run_cycle)
+    return found_live(recorded, report.result) if report.identical and report.result is not None else None
 
 
 def _finish(found: Detection, *, as_json: bool) -> int:

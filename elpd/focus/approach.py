@@ -8,63 +8,137 @@ from typing import TYPE_CHECKING
 from elpd.focus import safety
 from elpd.focus.ended import Ended
 from elpd.records import Outcome
-from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs
+from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
 
 if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings
     from elpd.focus.stage import Stage
     from elpd.focus.watch import Watch
-    from elpd.records import LensReport
+    from elpd.records import CommandStamp, LensReport
 
-APPROACH_MARGIN_UM = 2.0
-"""How much further than the backlash the final approach begins."""
+APPROACH_MARGIN_UM = 1.0
+"""How much further than the backlash the final approach begins: what a model of the motor may be wrong by, and a step."""
+
+BRAKING_SHARE = 0.25
+"""Of the final approach's way: so close before the turn the lens brakes, and the next command needs the time left."""
+
+TURN_MS = 5.0
+"""A turn is over within this time of the command that makes it."""
 
 RETURN_SHARE = 0.5
 """The way back leads over the same ground as the way out, and beyond: half its events at the least."""
 
 
-def latency_us(stage: Stage, watch: Watch, rest: LensReport) -> int | None:
-    """Return the time from the closing of the deciding window to the motor's last step."""
-    if watch.decided_us is None:
-        return None
-    decided_ns = stage.sensor_clock.to_host(watch.decided_us)
-    lens, when = stage.parts.lens, HostNs(rest.latest_ns)
-    while when > decided_ns and abs(lens.position_at(when).steps - rest.steps) < 1.0:
-        when = HostNs(when - NS_PER_MS // 8)
-    return int(max(0, when - decided_ns) // NS_PER_US)
-
-
 @dataclass(frozen=True, slots=True)
+class Standstill:
+    """How far the lens went after the stop, and the time from the closing of the deciding window to the last step."""
+
+    um: float
+    latency_us: int | None
+
+
+def standstill(stage: Stage, watch: Watch, stop: CommandStamp, sign: int) -> Standstill:
+    """Find the farthest place of the sweep: where the motor stood, or turned round."""
+    lens, until = stage.parts.lens, after_ms(stage.now_ns(), TURN_MS)
+
+    def farthest(begin_ns: int, end_ns: int, step_ns: int) -> tuple[float, int]:
+        times = range(begin_ns, max(begin_ns + 1, end_ns), step_ns)
+        return max((sign * lens.position_at(HostNs(when)).steps, -when) for when in times)
+
+    _, when = farthest(stop.begun_ns, until, NS_PER_MS)
+    steps, when = farthest(max(stop.begun_ns, -when - NS_PER_MS), min(until, -when + NS_PER_MS), NS_PER_MS // 8)
+    if watch.decided_us is None:
+        return Standstill(stage.to_um(sign * steps), None)
+    decided_ns, rest_ns = stage.sensor_clock.to_host(watch.decided_us), -when
+    while rest_ns > decided_ns and steps - sign * lens.position_at(HostNs(rest_ns)).steps < 1.0:
+        rest_ns -= NS_PER_MS // 8
+    return Standstill(stage.to_um(sign * steps), int(max(0, rest_ns - decided_ns) // NS_PER_US))
+
+
 class WayBack:
-    """Where the lens came to rest, and what was counted when it set out."""
+    """The way back to where focus was: past it by more than the play, and then there from the sweep's own side.
 
-    rest: LensReport
-    begun_ns: HostNs
-    events_before: int
+    A controller that takes another target in mid-motion sets out before anybody knows where focus was to the
+    micrometre, is told while it goes, and turns without resting: a turn takes no time but that of the ramps. The
+    others rest before every move.
+    """
 
+    def __init__(self, stage: Stage, watch: Watch, settings: CycleSettings, sign: int) -> None:
+        self._stage = stage
+        self._watch = watch
+        self._sign = sign
+        self._backlash_um = settings.backlash_um
+        self._speed_um_s = stage.to_um(stage.parts.lens.limits.max_speed_sps)
+        self._in_flight = stage.parts.lens.capabilities.native_velocity
+        self._aim_um: float | None = None
+        self.begun_ns = stage.now_ns()
+        self.events_before = watch.events_in_cycle
+        """What had been counted when the lens set out."""
 
-def go_back(stage: Stage, watch: Watch, settings: CycleSettings, focus_um: float, sign: int) -> WayBack:
-    """Go to where focus was, from the side the sweep came from: past it by more than the play, and then there."""
-    limits = stage.parts.lens.limits
-    begun_ns, events_before = stage.now_ns(), watch.events_in_cycle
-    stage.listener = watch.count
+    def set_out(self, focus_um: float) -> None:
+        """Send the lens past *focus_um*, as far as that is known yet. Does not wait."""
+        aim_um = self._turn_um(focus_um)
+        if self._aim_um is None:
+            self.begun_ns, self.events_before = self._stage.now_ns(), self._watch.events_in_cycle
+        elif abs(aim_um - self._aim_um) < self._stage.um_per_step:
+            return
+        self._aim_um = aim_um
+        self._stage.send(aim_um, self._speed_um_s)
 
-    def move(target_um: float) -> LensReport:
-        bounded = min(max(stage.to_steps(target_um), limits.min_steps), limits.max_steps)
-        return stage.move(stage.to_um(bounded), settings.speed_um_s, limits.acceleration_sps2)
+    def arrive(self, focus_um: float) -> LensReport:
+        """Turn beyond *focus_um*, go there, and return the report that the lens rests there."""
+        self.set_out(focus_um)
+        turn_um = self._turn_um(focus_um)
+        if self._in_flight:
+            self._await_braking(turn_um, abs(focus_um - turn_um))
+            turning_ns = self._stage.now_ns()
+            rest = self._move(focus_um)
+            if self._sign * (self._lowest_um(turning_ns) - turn_um) < APPROACH_MARGIN_UM:
+                return rest
+            self._move(turn_um)  # it turned too soon: the play may not have been taken up
+        else:
+            self._move(turn_um)
+        return self._move(focus_um)
 
-    move(focus_um - sign * (settings.backlash_um + APPROACH_MARGIN_UM))
-    return WayBack(move(focus_um), begun_ns, events_before)
+    def _turn_um(self, focus_um: float) -> float:
+        return self._stage.within_limits_um(focus_um - self._sign * (self._backlash_um + APPROACH_MARGIN_UM))
+
+    def _move(self, target_um: float) -> LensReport:
+        return self._stage.move(self._stage.within_limits_um(target_um), self._speed_um_s)
+
+    def _await_braking(self, turn_um: float, approach_um: float) -> None:
+        """Wait until the lens brakes towards the turn: from then on another target behind it changes only what follows.
+
+        It needs braking from where it has come to its top speed at the latest, and that is far from the turn.
+        """
+        stage = self._stage
+        until = after_ms(stage.now_ns(), stage.travel_limit_ms(turn_um, self._speed_um_s))
+        while stage.now_ns() < until and self._sign * (stage.here_um() - turn_um) > BRAKING_SHARE * approach_um:
+            stage.read()
+
+    def _lowest_um(self, turning_ns: HostNs) -> float:
+        """Return the farthest place of the way back, by the model that the reports have corrected since."""
+        lens = self._stage.parts.lens
+        times = range(turning_ns, after_ms(turning_ns, TURN_MS), NS_PER_MS // 4)
+        lowest = min(self._sign * lens.position_at(HostNs(when)).steps for when in times)
+        return self._stage.to_um(self._sign * lowest)
 
 
 def verify(
-    stage: Stage, watch: Watch, settings: CycleSettings, way: WayBack, *, focus_um: float, stop_um: float
+    stage: Stage,
+    watch: Watch,
+    settings: CycleSettings,
+    way: WayBack,
+    rest: LensReport,
+    *,
+    focus_um: float,
+    stop_um: float,
 ) -> int:
     """See that the lens is where it was sent, and that the scene changed on the way: reports alone prove nothing.
 
     Returns the events above noise that the way back made. Raises ``Ended`` if either is not so.
     """
-    error_um = stage.to_um(way.rest.steps) - focus_um
+    error_um = stage.to_um(rest.steps) - focus_um
     if abs(error_um) > max(0.25 * settings.depth_of_focus_um, 2 * stage.um_per_step):
         raise Ended(
             Outcome.LENS_DID_NOT_MOVE,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
 from elpd.focus import safety
-from elpd.focus.approach import go_back, latency_us, verify
+from elpd.focus.approach import WayBack, standstill, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
@@ -158,16 +158,15 @@ class FocusCycle:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         passed = self._search(watch)
         self._phase(Phase.STOP)
-        rest = self._stage.rest(REST_LIMIT_MS)
-        stop_um = self._stop_um = self._stage.to_um(rest.steps)
-        self._stop_latency_us = latency_us(self._stage, watch, rest)
         sign = self._details["sweep_sign"]
+        way = WayBack(self._stage, watch, self._settings, sign)
+        stop_um = self._come_to_rest(watch, passed, way, sign)
         estimate = self._judge(watch, sign, passed.begun_um, stop_um)
         self._phase(Phase.RETURN)
-        way = go_back(self._stage, watch, self._settings, estimate.focus_um, sign)
+        rest = way.arrive(estimate.focus_um)
         self._phase(Phase.VERIFY)
         self._details["return_events"] = verify(
-            self._stage, watch, self._settings, way, focus_um=estimate.focus_um, stop_um=stop_um
+            self._stage, watch, self._settings, way, rest, focus_um=estimate.focus_um, stop_um=stop_um
         )
         return Outcome.FOCUSED, self._sentence(estimate)
 
@@ -265,6 +264,25 @@ class FocusCycle:
             self._reversals = search.reversals
             self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
+    def _come_to_rest(self, watch: Watch, passed: SweepReport, way: WayBack, sign: int) -> float:
+        """See the sweep to its end; return where that was.
+
+        A controller that stops on the next step is told at once to go back to about where focus was: the events of the
+        last step, and what is computed from them, arrive while it goes.
+        """
+        assert passed.stop is not None, "a sweep that has passed focus sent its stop"
+        stage, capabilities = self._stage, self._parts.lens.capabilities
+        ended_ns = after_ms(passed.stop.done_ns, capabilities.stop_onset_ms)
+        watch.turn(stage.sensor_clock.to_sensor(ended_ns))
+        if capabilities.abrupt_stop and capabilities.native_velocity:
+            way.set_out(watch.roughly_um)
+            stage.hear(safety.CAMERA_SILENCE_MS)
+        else:
+            stage.rest(REST_LIMIT_MS)
+        ended = standstill(stage, watch, passed.stop, sign)
+        self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
+        return ended.um
+
     def _judge(self, watch: Watch, sign: int, begun_um: float, stop_um: float) -> FocusEstimate:
         """Say where focus was, and refuse an answer that the evidence does not carry."""
         estimate = watch.estimate()
@@ -336,7 +354,7 @@ class FocusCycle:
         place = {"hold": None, "start": self._start_um, "preset": self._settings.preset_um}[self._settings.on_failure]
         if place is None or abs(self._stage.here_um() - place) < self._stage.um_per_step:
             return
-        self._stage.move(place, self._settings.speed_um_s, self._parts.lens.limits.acceleration_sps2)
+        self._stage.move(place, self._settings.speed_um_s)
 
     def _stop_hard(self) -> None:
         """Send the strongest stop, whatever else is broken."""

@@ -135,14 +135,25 @@ class Stage:
         while self.now_ns() < until:
             self.read(min(READ_TIMEOUT_S, (until - self.now_ns()) / 1e9))
 
-    def move(self, target_um: float, speed_um_s: float, acceleration_sps2: float) -> LensReport:
+    def within_limits_um(self, um: float) -> float:
+        """Return the place nearest to *um* that the lens may go to."""
+        limits = self.parts.lens.limits
+        return min(max(um, self.to_um(limits.min_steps)), self.to_um(limits.max_steps))
+
+    def send(self, target_um: float, speed_um_s: float) -> None:
+        """Let the lens set out to a place."""
+        self.parts.lens.move_to(self.to_steps(target_um), speed_um_s / self.um_per_step)
+
+    def travel_limit_ms(self, target_um: float, speed_um_s: float) -> float:
+        """Return how long the way from here to a place may take: three times what it should, ramps allowed for."""
+        ramps_s = 2 * speed_um_s / max(self.to_um(self.parts.lens.limits.acceleration_sps2), 1.0)
+        return 300.0 + 3000.0 * (abs(target_um - self.here_um()) / speed_um_s + ramps_s)
+
+    def move(self, target_um: float, speed_um_s: float) -> LensReport:
         """Go to a place and wait until at rest there. The wait is bounded by the way and the speed."""
-        steps = self.to_steps(target_um)
-        speed_sps = speed_um_s / self.um_per_step
-        start = self.parts.lens.position_at(self.now_ns()).steps
-        self.parts.lens.move_to(steps, speed_sps)
-        way_s = abs(steps - start) / speed_sps + 2 * speed_sps / max(acceleration_sps2, 1.0)
-        return self.rest(300.0 + 3000.0 * way_s, steps)
+        limit_ms = self.travel_limit_ms(target_um, speed_um_s)
+        self.send(target_um, speed_um_s)
+        return self.rest(limit_ms, self.to_steps(target_um))
 
     def hear(self, limit_ms: float) -> None:
         """Read until the camera has spoken of the time after now: what follows may be judged by its silence.

@@ -52,13 +52,14 @@ TICK_DOF = 0.5
 PATIENCE_DOF = 8.0
 """How far beyond a sign change of ELP the image's sharpness may take to agree: a curve's width and a half."""
 
+AFTERMATH_DOF = 2.0
+"""Travel beyond the decision whose events still count: pixels with little contrast answer late."""
+
+FOR_EVER = SensorUs(1 << 62)
+
 LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
-
-FAR_DROP = 0.2
-"""Fall of log sharpness beyond the peak before the stop: pixels with little contrast or light answer late, and their
-answers are worth the few micrometres."""
 
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
@@ -137,6 +138,7 @@ class Watch:
         self._passed = False
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
+        self._turned_us = FOR_EVER
         self._sign = 1
         self._begun_us = SensorUs(0)
         self._judge_from = float("-inf")
@@ -197,6 +199,7 @@ class Watch:
         self._frames = []
         self._gaps_us = []
         self.decided_us = None
+        self._turned_us = FOR_EVER
         self.events = 0
 
     def feed(self, packet: CameraPacket) -> list[ElpSample]:
@@ -217,7 +220,7 @@ class Watch:
                 continue
             self._detector.feed(sample)
             seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
+            if seen and not self._passed and self._memory.peak_passed:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
@@ -233,10 +236,24 @@ class Watch:
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
-        if self._passed:
-            return  # a motor that brakes late goes far beyond what is of interest
-        first = int(np.searchsorted(events.t, self._begun_us, side="left"))
-        self._memory.add(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+        first, last = np.searchsorted(events.t, [self._begun_us, self._turned_us], side="left")
+        part = slice(int(first), int(last))
+        self._memory.add(events.t[part], events.x[part], events.y[part], events.p[part])
+
+    def turn(self, at_us: SensorUs) -> None:
+        """Take note that the sweep ends at *at_us*: what comes later is of the way back.
+
+        A motor that brakes late goes far beyond what is of interest; ``AFTERMATH_DOF`` of that is listened to.
+        """
+        assert self.decided_us is not None, "turn() comes after the decision"
+        aftermath_us = 1e6 * AFTERMATH_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
+        self._turned_us = min(at_us, SensorUs(self.decided_us + round(aftermath_us)))
+
+    @property
+    def roughly_um(self) -> float:
+        """Where the events' own image was sharpest so far: late by a depth of focus or two, but known at once."""
+        track = self._memory.track
+        return self._sign * track.positions[track.peak]
 
     def _tick(self, sample: ElpSample, end_um: float) -> None:
         """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
@@ -284,7 +301,10 @@ class Watch:
         if self.decided_us is None:
             return None
         memory = self._memory
-        ruler = self._ruler(self._begun_us, self.decided_us)
+        end_us = max(self.decided_us, min(self._turned_us, self._last_us))
+        ruler = self._ruler(self._begun_us, end_us)
+        if end_us > memory.track.times_us[-1]:
+            memory.advance(end_us, self._sign * self._locate(SensorUs(end_us)))
         deaf = memory.refractory()
         said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
         if said is None:
@@ -325,6 +345,12 @@ class Watch:
         assert self._windows is not None, "begin() comes before count()"
         for row in self._windows.feed(packet):
             self.events_in_cycle += int(row["n_on"] + row["n_off"])
+
+    def hear_out(self, packet: CameraPacket) -> None:
+        """Take a packet after the decision: keep what is still of the sweep, count the rest."""
+        if self._last_us < self._turned_us:
+            self.keep(packet)
+        self.count(packet)
 
     # --- pieces ---
 

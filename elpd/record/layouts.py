@@ -11,6 +11,7 @@ too. Frames are loaded when their time comes, not before.
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 from dataclasses import dataclass, field
@@ -36,9 +37,17 @@ FRAME_FOLDERS = ("davis_frames_50", "frames", "davis_frames_20", "davis_frames_1
 """Where the authors keep frames, best first."""
 
 _FRAME_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".pgm", ".bmp"}
-_REGION = re.compile(r"roi[^:=\n]*[:=]\s*\(?\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)", re.IGNORECASE)
+_REGION = re.compile(r"^[^\n]*\broi\b[^:=\n]*[:=]([^\n]*)$", re.IGNORECASE | re.MULTILINE)
+_NUMPY_TYPE = re.compile(r"\b(?:np\.|numpy\.)?u?(?:int|float)\d*\b")
+_NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?", re.IGNORECASE)
+_STAMP = re.compile(r"\d+(?:\.\d+)?(?:e\+?\d+)?", re.IGNORECASE)
+"""A frame's name: microseconds, whole ones or as a program prints them. It is used from the next whole one on."""
 _BIN = re.compile(r"^\s*delta_t\s*[:=]\s*(\d+(?:\.\d+)?)", re.IGNORECASE | re.MULTILINE)
 _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (1280, 720))
+
+_MANY = 100
+_LEAST_GAP_US = 1e-3
+"""No sensor sends a thousand events in a microsecond."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +124,7 @@ class _Info:
 
     region: tuple[int, int, int, int] | None = None
     bin_us: int | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def _read_info(info: Path) -> _Info:
@@ -122,19 +132,26 @@ def _read_info(info: Path) -> _Info:
         text = info.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return _Info()
-    region = _REGION.search(text)
-    width = _BIN.search(text)
-    y1, y2, x1, x2 = (int(part) for part in region.groups()) if region else (0, 0, 0, 0)
-    return _Info((y1, y2, x1, x2) if region else None, round(float(width.group(1))) if width else None)
+    found = _BIN.search(text)
+    bin_us = round(float(found.group(1))) if found else None
+    line = _REGION.search(text)
+    if line is None:
+        return _Info(None, bin_us)
+    numbers = [round(float(part)) for part in _NUMBER.findall(_NUMPY_TYPE.sub("", line.group(1)))]
+    if len(numbers) != 4:
+        what = f"the region {line.group(1).strip()!r} of {INFO_NAME} is not four numbers (y1, y2, x1, x2)"
+        return _Info(None, bin_us, (f"{what}; the sensor is used whole",))
+    y1, y2, x1, x2 = numbers
+    return _Info((y1, y2, x1, x2), bin_us)
 
 
 def _frames_in(folder: Path) -> tuple[FrameFile, ...]:
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder of frames; give --frames DIR relative to the sweep, or none")
     found = [
-        FrameFile(int(entry.stem), entry)
+        FrameFile(math.ceil(float(entry.stem)), entry)
         for entry in folder.iterdir()
-        if entry.suffix.lower() in _FRAME_SUFFIXES and entry.stem.isdigit()
+        if entry.suffix.lower() in _FRAME_SUFFIXES and _STAMP.fullmatch(entry.stem)
     ]
     if not found:
         raise FormatError(f"{folder}: no frames named <microseconds>.jpg or .png; give --frames none to do without")
@@ -216,7 +233,7 @@ def _assemble(
     frames: Sequence[FrameFile],
     warnings: Sequence[str],
 ) -> RecordedSweep:
-    notes = list(warnings)
+    notes = [*warnings, *info.warnings]
     region = info.region
     sizes = {name: column.size for name, column in columns.items()}
     if not columns or not all(sizes.values()):
@@ -225,6 +242,7 @@ def _assemble(
         raise FormatError(f"{path}: t, x, y and p differ in length ({sizes}); they must describe the same events")
     if not all(np.isfinite(column).all() for column in columns.values() if np.issubdtype(column.dtype, np.floating)):
         raise FormatError(f"{path}: values that are not finite numbers among the events")
+    _refuse_seconds(path, columns["t"])
     t_us = columns["t"].astype(np.int64)
     x = columns["x"].astype(np.int64)
     y = columns["y"].astype(np.int64)
@@ -241,6 +259,13 @@ def _assemble(
         order = np.argsort(t_us, kind="stable")
         notes.append(f"{int((np.diff(t_us) < 0).sum())} time stamps stepped back; the events were sorted")
         t_us, x, y, on = t_us[order], x[order], y[order], on[order]
+    # One frame from just before the sweep is as good as any; further off than the sweep is long, clocks differ.
+    begin_us, end_us = int(t_us[0]), int(t_us[-1])
+    if frames and not any(2 * begin_us - end_us <= frame.t_us <= end_us for frame in frames):
+        notes.append(
+            f"none of the {len(frames)} frames ({frames[0].t_us} .. {frames[-1].t_us} us) was taken while events came "
+            f"({begin_us} .. {end_us} us); are both in microseconds of one clock?"
+        )
     roi = Roi(0, 0, geometry.width, geometry.height)
     if region is not None:
         y1, y2, x1, x2 = region
@@ -254,6 +279,17 @@ def _assemble(
     return RecordedSweep(
         t_us, x.astype(np.uint16), y.astype(np.uint16), on, geometry, roi, tuple(frames), info.bin_us, tuple(notes)
     )
+
+
+def _refuse_seconds(path: Path, t: NDArray[Any]) -> None:
+    """Refuse stamps that fall within a few microseconds of one another and have fractions: those are seconds."""
+    if not np.issubdtype(t.dtype, np.floating):
+        return
+    span = float(np.ptp(t))
+    if t.size > _MANY and span < t.size * _LEAST_GAP_US and (t != np.rint(t)).any():
+        raise FormatError(
+            f"{path}: {t.size} events within {span:.6g} us, in fractions; these are probably seconds: multiply by 1e6"
+        )
 
 
 def _size_of(x: NDArray[np.int64], y: NDArray[np.int64], region: tuple[int, int, int, int] | None) -> Geometry:

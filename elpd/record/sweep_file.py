@@ -43,6 +43,9 @@ _RESTLESS = 4.0
 """In a scene that moves (windows scatter more than twice as widely as still ones), frames are the better witness: they
 are waited for a little longer than the slowest usual frame rate would take."""
 
+_FRAMES_AFTER_US = 50_000
+"""Frames this long after the last event still belong to the record; later ones show what no event has seen."""
+
 _PATIENT_DROP = 0.2
 """Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
 
@@ -114,6 +117,8 @@ class SweepSearch:
         self._attempts_until = 0
         self._width: float | None = None
         self._doubtful: Detection | None = None
+        self._blank = 0
+        """Frames so far without structure, none with."""
 
     def run(self) -> Detection:
         """Go through the recording until focus is found or it ends."""
@@ -122,7 +127,10 @@ class SweepSearch:
                 return self._flat(self._begin_us)
             self._meter.set_reference(self._reference)
         done = self._first
+        last_us = int(self._sweep.t_us[-1]) + _FRAMES_AFTER_US
         for frame in self._sweep.frames:
+            if frame.t_us > last_us:
+                break
             until = int(np.searchsorted(self._sweep.t_us, frame.t_us, side="left"))
             found = self._events(done, max(done, until), frame.t_us if frame.t_us > self._begin_us else None)
             if found is None:
@@ -162,9 +170,11 @@ class SweepSearch:
         check_size(pixels.shape, self._sweep.geometry, f"frame of {t_us} us")
         reference = reference_from_frame(pixels, self._roi)
         if self._reference is None and not reference.textured:
-            return self._flat(t_us)
-        self._reference = reference
-        self._meter.set_reference(reference)
+            self._blank += 1  # too dark, or too far out of focus yet: the events go on without it
+        else:
+            self._blank = 0
+            self._reference = reference
+            self._meter.set_reference(reference)
         if t_us < self._begin_us:
             return None
         self._frames.add(t_us, self._ruler.position(t_us), self._frame_energy.measure(pixels))
@@ -172,9 +182,12 @@ class SweepSearch:
         return None if found is None else replace(found, decided_us=t_us)
 
     def _frames_are_coming(self, now_us: int) -> bool:
-        """Whether there are frames often enough to draw a curve: three so far, and none has failed to come."""
+        """Whether there are frames often enough to draw a curve: three so far, and none has failed to come.
+
+        Frames without any structure draw none: they do not keep the events from answering.
+        """
         times = self._frames.times_us
-        return len(times) >= 3 and now_us - times[-1] <= 2.0 * float(np.median(np.diff(times)))
+        return not self._blank and len(times) >= 3 and now_us - times[-1] <= 2.0 * float(np.median(np.diff(times)))
 
     def _frames_are_too_coarse(self) -> bool:
         """Whether frames have seen focus go by and yet have no vertex: the lens is too fast for them to draw a top."""
@@ -232,11 +245,17 @@ class SweepSearch:
                 "focus; sweep more slowly, or give frames or a larger region",
             )
             return None
-        if found.direction is Direction.UNKNOWN:
-            # Without a picture the direction is only known once focus has gone by.
+        if found.direction is not Direction.APPROACHING and self._on_the_first_way(now_us):
+            # Without a picture the direction is only known once focus has gone by; and shaking may have misled ELP.
             found = replace(found, direction=Direction.APPROACHING, direction_decided_us=now_us)
         names = ", ".join(f"{name} {weight:.0%}" for name, _, _, weight in estimate.contributions)
         return replace(found, reason=f"focus was passed; measured by {names}")
+
+    def _on_the_first_way(self, now_us: int) -> bool:
+        """Whether the lens has not turned yet: a focus that was passed then lay ahead, whatever ELP said first."""
+        set_out_us, _, _ = self._ruler.stretch(now_us)
+        _, until_us, sign = self._ruler.stretch(self._begin_us)
+        return set_out_us <= self._begin_us or (sign == 0.0 and set_out_us <= until_us)
 
     def _report(self, outcome: Outcome, reason: str, estimate: FocusEstimate | None, now_us: int | None) -> Detection:
         detector = self._detector
@@ -266,7 +285,7 @@ class SweepSearch:
         first = self._detector.first
         return (Direction.UNKNOWN, None) if first is None else (first.direction, first.decided_us)
 
-    def _flat(self, t_us: int) -> Detection:
+    def _flat(self, t_us: int | None) -> Detection:
         return self._report(
             Outcome.NO_TEXTURE,
             "the reference shows no structure above its own noise; choose a region with texture, or add light",
@@ -278,6 +297,8 @@ class SweepSearch:
         detector = self._detector
         if self._doubtful is not None:
             return self._doubtful
+        if self._blank:
+            return self._flat(None)
         if detector.events < MIN_EVENTS:
             return self._report(
                 Outcome.TOO_FEW_EVENTS,

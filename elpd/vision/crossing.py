@@ -62,8 +62,13 @@ UNANSWERED = 0.23
 
 TICKS = 64
 FEWEST_TICKS = 24
-LEVELS_AT_ONCE = 1 << 24
-"""Pixels times ticks of a rebuilt curve, four bytes each: a whole megapixel is rebuilt at fewer ticks."""
+LEVELS_AT_ONCE = 1 << 20
+"""Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt, because a lens waits for them."""
+
+STILL_SHARE = 0.9
+SAMPLE_PX = 1 << 15
+"""Where so many pairs agree, the scene is still and the pairs, ten times better known, have the say: the vertex then
+only has to confirm them, and so many pixels are enough for that."""
 
 FLANK = 0.6
 ROI_MARGIN_PX = 14
@@ -109,6 +114,10 @@ class EventStretch:
     height: int
     width: int
     margin: int
+
+
+Groups = tuple["NDArray[np.int64]", "NDArray[np.int64]"]
+"""Events by pixel: ``integral.group_by_pixel``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,16 +179,49 @@ def ask_events(
     *brightness*, (height, width) of the cut-out, relative to the brightest parts, tells how slow each pixel's
     photoreceptor is; with it, the pairs themselves measure the lag, and both witnesses are freed of it.
     """
+    weight, slowness = _by_brightness(brightness, events)
+    groups = _by_pixel(events)
+    at_peak, _ = _rebuilt(events, groups, np.array([peak]))
+    pairs, lag = _pair_mode(events, at_peak[0], peak, end, slowness)
+    if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
+        rows = _busiest_rows(events)
+        events, weight, slowness = _rows_of(events, rows), weight[rows], slowness[rows]
+        groups = _by_pixel(events)
     pixels = max(1, events.height * events.width)
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
-    weight, slowness = _by_brightness(brightness, events)
-    vertex, level_at_peak = _vertex(events, ticks, peak, weight)
-    pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness)
-    if lag.at > 0.0 and vertex is not None:
+    vertex = None
+    if lag.at > 0.0:
         quick = replace(events, position=events.position - lag.at * slowness[events.y, events.x])
-        corrected, _ = _vertex(quick, ticks, peak, weight)
-        vertex = corrected or vertex
+        vertex = _vertex(quick, groups, ticks, weight, peak)
+    if vertex is None:
+        vertex = _vertex(events, groups, ticks, weight, peak)
     return EventWitnesses(vertex, pairs, lag)
+
+
+def _by_pixel(events: EventStretch) -> Groups:
+    return group_by_pixel(events.y.astype(np.int64) * events.width + events.x, max(1, events.height * events.width))
+
+
+def _busiest_rows(events: EventStretch) -> slice:
+    """Return a stretch of rows of at most ``SAMPLE_PX`` pixels, that with the most events."""
+    count = min(events.height, max(SAMPLE_PX // events.width, 4 * events.margin))
+    below = np.concatenate([[0], np.cumsum(np.bincount(events.y, minlength=events.height))])
+    first = int(np.argmax(below[count:] - below[:-count]))
+    return slice(first, first + count)
+
+
+def _rows_of(events: EventStretch, rows: slice) -> EventStretch:
+    inside = (events.y >= rows.start) & (events.y < rows.stop)
+    return EventStretch(
+        events.t_us[inside],
+        events.x[inside],
+        (events.y[inside] - rows.start).astype(np.uint16),
+        events.on[inside],
+        events.position[inside],
+        rows.stop - rows.start,
+        events.width,
+        events.margin,
+    )
 
 
 def _by_brightness(
@@ -195,9 +237,9 @@ def _by_brightness(
 
 
 def _vertex(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
-) -> tuple[Vertex | None, NDArray[np.float32]]:
-    curve, level_at_peak = _rebuilt_curve(events, ticks, peak, weight)
+    events: EventStretch, groups: Groups, ticks: NDArray[np.float64], weight: NDArray[np.float32], peak: float
+) -> Vertex | None:
+    curve = _rebuilt_curve(events, groups, ticks, weight)
     end = float(ticks[-1])
     wide = fit_vertex(ticks, curve, end - float(ticks[0]))
     vertex = None
@@ -210,7 +252,7 @@ def _vertex(
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
     if vertex is not None and vertex.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
         vertex = None
-    return vertex, level_at_peak
+    return vertex
 
 
 def frame_witness(vertex: Vertex, spacing: float) -> Witness:
@@ -244,22 +286,28 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
 
 
 def _rebuilt_curve(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    pixels = events.height * events.width
-    pixel = events.y.astype(np.int64) * events.width + events.x
-    starts, order = group_by_pixel(pixel, pixels)
-    level = np.zeros((ticks.size, pixels), dtype=np.float32)
-    squares = np.zeros((ticks.size, 2))
-    rebuild_levels(starts, order, events.position, events.on, ticks, level, squares)
-    mismatch = MISMATCH**2 * squares.sum(axis=1) / pixels
-    images = level.reshape(ticks.size, events.height, events.width)
+    events: EventStretch, groups: Groups, ticks: NDArray[np.float64], weight: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Return log S of the rebuilt image at each tick, the mean of the bands."""
+    images, mismatch = _rebuilt(events, groups, ticks)
     curve = np.zeros(ticks.size)
     for band in BANDS_PX:
         energy = np.array([band_energy(image, band, weight, events.margin) for image in images])
         energy = np.maximum(energy - band_gain(band) * mismatch, 1e-3 * energy)
         curve += np.log(energy + 1e-12) / len(BANDS_PX)
-    return curve, images[int(np.argmin(np.abs(ticks - peak)))]
+    return curve
+
+
+def _rebuilt(
+    events: EventStretch, groups: Groups, ticks: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return the image at each tick, in thresholds, and the variance that unequal thresholds add to it."""
+    pixels = events.height * events.width
+    level = np.empty((ticks.size, pixels), dtype=np.float32)
+    squares = np.zeros((ticks.size, 2))
+    starts, order = groups
+    rebuild_levels(starts, events.position[order], events.on[order], ticks, level, squares)
+    return level.reshape(ticks.size, events.height, events.width), MISMATCH**2 * squares.sum(axis=1) / pixels
 
 
 def _pair_mode(

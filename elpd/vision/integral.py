@@ -34,43 +34,74 @@ MISMATCH = 0.15
 _BAND_RATIO = 1.6
 
 
-def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
-    """Return the weighted mean square of one band of *image*, leaving *margin* pixels at each side out of the mean.
+def inside_margin(shape: tuple[int, int], margin: int) -> tuple[slice, slice]:
+    """Return what a margin of *margin* pixels at each side leaves of an image.
 
     Of a small image less is left out: at least its middle eight pixels are measured.
     """
-    margin = max(0, min(margin, (min(image.shape) - 8) // 2))
-    inner = cv2.GaussianBlur(image, (0, 0), scale_px)
-    inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
-    inside = slice(margin, -margin or None)
-    square = np.square(inner[inside, inside])
-    square *= weight[inside, inside]
+    margin = max(0, min(margin, (min(shape) - 8) // 2))
+    return slice(margin, -margin or None), slice(margin, -margin or None)
+
+
+def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
+    """Return the weighted mean square of one band of *image*, leaving a margin out of the mean (``inside_margin``)."""
+    inside = inside_margin((image.shape[0], image.shape[1]), margin)
+    square = np.square(band_image(image, scale_px)[inside])
+    square *= weight[inside]
     return float(square.mean(dtype=np.float64))
 
 
-def band_gain(scale_px: float) -> float:
-    """Return the variance that white noise of unit variance has in a band: the sum of the kernel's squares."""
+def band_stamp(scale_px: float) -> NDArray[np.float32]:
+    """Return a band's impulse response, square and of odd size."""
     impulse = np.zeros((33, 33), dtype=np.float32)
     impulse[16, 16] = 1.0
-    return band_energy(impulse, scale_px, np.ones_like(impulse)) * impulse.size
+    response = band_image(impulse, scale_px)
+    reach = int(np.abs(np.flatnonzero(response[16]) - 16).max())
+    return np.ascontiguousarray(response[16 - reach : 17 + reach, 16 - reach : 17 + reach])
 
 
-@kernel("void(uint16[::1], uint16[::1], uint8[::1], int32[:, ::1])")
-def add_events(
+def band_gain(scale_px: float) -> float:
+    """Return the variance that white noise of unit variance has in a band: the sum of the response's squares."""
+    return float(np.square(band_stamp(scale_px), dtype=np.float64).sum())
+
+
+def band_image(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
+    band = cv2.GaussianBlur(image, (0, 0), scale_px)
+    band -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
+    return np.asarray(band, dtype=np.float32)
+
+
+@kernel("void(uint16[::1], uint16[::1], uint8[::1], float32[:, ::1], float32[:, ::1])")
+def stamp_events(
     x: NDArray[np.uint16],
     y: NDArray[np.uint16],
     on: NDArray[np.uint8],
-    level: NDArray[np.int32],
+    stamp: NDArray[np.float32],
+    band: NDArray[np.float32],
 ) -> None:
-    """Add ±1 per event to *level*, (height, width), in place."""
+    """Add *stamp* around the pixel of each ON event to *band*, (height, width), and subtract it for each OFF event.
+
+    What falls outside is lost.
+    """
+    height, width = band.shape
+    size = stamp.shape[0]
+    reach = size // 2
     for i in range(x.size):
-        level[y[i], x[i]] += 2 * np.int32(on[i]) - 1
+        sign = np.float32(1.0) if on[i] else np.float32(-1.0)
+        left = np.int64(x[i]) - reach
+        top = np.int64(y[i]) - reach
+        begin = max(0, -left)
+        end = min(size, width - left)
+        for row in range(max(0, -top), min(size, height - top)):
+            target = band[top + row, left + begin : left + end]
+            source = stamp[row, begin:end]
+            for column in range(target.size):
+                target[column] += sign * source[column]
 
 
-@kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
+@kernel("void(int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
 def rebuild_levels(
     starts: NDArray[np.int64],
-    order: NDArray[np.int64],
     position: NDArray[np.float64],
     on: NDArray[np.uint8],
     ticks: NDArray[np.float64],
@@ -81,10 +112,10 @@ def rebuild_levels(
 
     Parameters
     ----------
-    starts, order:
-        Events of pixel ``k`` in time order are ``order[starts[k] : starts[k + 1]]``.
+    starts:
+        Events of pixel ``k``, in time order, are ``starts[k] : starts[k + 1]``.
     position, on:
-        Lens position (rising with time) and polarity of each event.
+        Lens position (rising with time) and polarity of each event, grouped by pixel (``group_by_pixel``).
     ticks:
         Positions at which the levels are wanted, rising.
     level:
@@ -101,24 +132,20 @@ def rebuild_levels(
         at = -1e300  # where the last knot lies; before the first event the level is constant
         n_on = 0
         n_off = 0
-        for j in range(begin, end):
-            i = order[j]
+        for i in range(begin, end):
             here = position[i]
             step = 1.0 if on[i] else -1.0
-            if j == begin:
+            if i == begin:
                 while tick < n_ticks and ticks[tick] < here:
                     level[tick, k] = value
                     tick += 1
             else:
-                previous = order[j - 1]
-                last = position[previous]
-                if on[previous] != on[i]:
+                last = position[i - 1]
+                if on[i - 1] != on[i]:
                     # The turn: the level of the last event is met again on the way back.
                     mirrored = 0.5 * (last + here)
-                    if j - 2 >= begin:
-                        earlier = order[j - 2]
-                        if on[earlier] == on[previous]:
-                            mirrored = max(here - (last - position[earlier]), mirrored)
+                    if i - 2 >= begin and on[i - 2] == on[i - 1]:
+                        mirrored = max(here - (last - position[i - 2]), mirrored)
                     at = mirrored
                 else:
                     at = last
@@ -162,10 +189,32 @@ class Vertex:
 
 def group_by_pixel(pixel: NDArray[np.int64], pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return (starts, order): a stable sort of event indices by pixel."""
-    order = np.argsort(pixel, kind="stable").astype(np.int64)
     starts = np.zeros(pixels + 1, dtype=np.int64)
-    np.cumsum(np.bincount(pixel, minlength=pixels), out=starts[1:])
+    order = np.empty(pixel.size, dtype=np.int64)
+    sort_by_pixel(pixel, starts, order)
     return starts, order
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1])")
+def sort_by_pixel(pixel: NDArray[np.int64], starts: NDArray[np.int64], order: NDArray[np.int64]) -> None:
+    """Sort event indices by pixel, stably, by counting.
+
+    *starts*, (pixels + 1), begins as zeros; afterwards the events of pixel ``k`` are
+    ``order[starts[k] : starts[k + 1]]``.
+    """
+    for i in range(pixel.size):
+        starts[pixel[i]] += 1
+    behind = 0
+    for k in range(starts.size):
+        count = starts[k]
+        starts[k] = behind
+        behind += count
+    for i in range(pixel.size):
+        order[starts[pixel[i]]] = i
+        starts[pixel[i]] += 1
+    for k in range(starts.size - 1, 0, -1):
+        starts[k] = starts[k - 1]
+    starts[0] = 0
 
 
 def fit_vertex(position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float) -> Vertex | None:

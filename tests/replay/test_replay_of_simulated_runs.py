@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import structlog
 from click.testing import CliRunner
 
 from elpd import rig
+from elpd.cli import detect as detect_command
 from elpd.cli import replay as replay_command
 from elpd.cli.session import focus_once
 from elpd.config import Config
@@ -18,8 +20,10 @@ from elpd.focus.cycle import FocusCycle
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.record.journal import RunWriter
 from elpd.record.replay import load_run, replay_run
+from elpd.record.run_sweep import read_run_sweep
 from elpd.record.tape import open_file
 from elpd.records import Outcome
+from elpd.vision.ruler import Ruler
 
 if TYPE_CHECKING:
     from elpd.records import FocusResult
@@ -57,6 +61,50 @@ def test_the_replay_reaches_the_same_decision(run: Path) -> None:
     assert {key: fields[key] for key in kept.result} == kept.result
     assert fields["truth"] == kept.truth
     assert kept.truth is not None
+
+
+def detected(run: Path, *options: str) -> dict[str, Any]:
+    answer = CliRunner().invoke(detect_command.command, [str(run), "--json", *options], standalone_mode=False)
+    assert answer.exception is None, answer.exception
+    fields: dict[str, Any] = json.loads(answer.stdout)
+    assert answer.return_value == (0 if fields["outcome"] == "FOCUSED" else 1)
+    return fields
+
+
+def test_the_detector_finds_in_a_run_what_the_cycle_found(run: Path) -> None:
+    fields, kept, sweep = detected(run), load_run(run).result, read_run_sweep(run)
+    assert kept is not None
+    assert fields["outcome"] == kept["outcome"] == "FOCUSED"
+    assert fields["method"] == kept["details"]["method"]
+    assert fields["direction"] == ("receding" if kept["reversals"] else "approaching")
+    assert fields["direction_decided_us"] < fields["focus_us"] < fields["decided_us"]
+    path = Ruler.of_path(sweep.path_t_us, sweep.path_um)
+    assert abs(path.position(fields["focus_us"]) - kept["focus_um"]) < kept["sigma_um"]
+    assert fields["sigma_us"] * path.speed_at(fields["focus_us"]) == pytest.approx(kept["sigma_um"], rel=0.05)
+
+
+def test_what_a_run_claims_is_not_believed_unseen(run: Path, tmp_path: Path) -> None:
+    """A result that its own record does not reach again is searched for, not repeated."""
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    head = json.loads((copy / "run.json").read_text())
+    head["result"]["focus_um"] += 1000.0
+    (copy / "run.json").write_text(json.dumps(head))
+    assert "run again" in detected(run)["reason"]
+    assert "run again" not in detected(copy)["reason"]
+
+
+def test_a_run_asked_another_question_is_searched(run: Path) -> None:
+    assert "run again" not in detected(run, "--dof-um", "6")["reason"]
+
+
+def test_a_run_that_turned_round_says_so(tmp_path: Path) -> None:
+    run = recorded(tmp_path, camera="davis346", start_um=-80.0)
+    kept, fields = load_run(run).result, detected(run)
+    assert kept is not None
+    assert kept["reversals"] == 1
+    assert fields["outcome"] == kept["outcome"] == "FOCUSED"
+    assert fields["direction"] == "receding"
+    assert fields["direction_decided_us"] < fields["focus_us"] < fields["decided_us"]
 
 
 def test_the_same_seed_writes_the_same_bytes(run: Path, tmp_path: Path) -> None:

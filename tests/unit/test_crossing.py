@@ -9,9 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elpd.vision.crossing import Witness, frame_witness, fuse, without_lag
-from elpd.vision.integral import Vertex, add_events, fit_vertex, group_by_pixel, rebuild_levels
+from elpd.vision.integral import (
+    BANDS_PX,
+    Vertex,
+    band_energy,
+    band_gain,
+    fit_vertex,
+    group_by_pixel,
+    rebuild_levels,
+    stamp_events,
+)
 from elpd.vision.pairs import weighted_mode
-from elpd.vision.track import PeakTrack
+from elpd.vision.track import EventEnergy, PeakTrack
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.floats(0.001, 1.0)), min_size=1, max_size=40))
@@ -23,7 +32,7 @@ def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
     starts, order = group_by_pixel(pixel, 3)
     level = np.zeros((17, 3), np.float32)
     squares = np.zeros((17, 2))
-    rebuild_levels(starts, order, position, on, ticks, level, squares)
+    rebuild_levels(starts, position[order], on[order], ticks, level, squares)
     for k in range(3):
         events = [(float(z), bool(p)) for z, p, one in zip(position, on, pixel, strict=True) if one == k]
         expected = [naive_vision.level_at(events, tick) if events else 0.0 for tick in ticks]
@@ -35,11 +44,40 @@ def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
     np.testing.assert_array_equal(squares, counted)
 
 
-def test_events_add_up() -> None:
-    level = np.zeros((2, 3), np.int32)
-    x, y, on = np.array([0, 2, 2], np.uint16), np.array([1, 0, 0], np.uint16), np.array([0, 1, 1], np.uint8)
-    add_events(x, y, on, level)
-    assert level.tolist() == [[0, 0, 2], [-1, 0, 0]]
+@given(st.lists(st.integers(0, 6), max_size=60))
+def test_events_are_grouped_by_pixel_in_their_order(pixels: Any) -> None:
+    starts, order = group_by_pixel(np.array(pixels, np.int64), 7)
+    for k in range(7):
+        assert order[starts[k] : starts[k + 1]].tolist() == [i for i, pixel in enumerate(pixels) if pixel == k]
+
+
+@given(st.lists(st.tuples(st.integers(0, 22), st.integers(0, 18), st.booleans()), max_size=60))
+def test_stamped_events_are_their_twin(rows: Any) -> None:
+    x, y = (np.array([row[k] for row in rows], np.uint16) for k in (0, 1))
+    on = np.array([row[2] for row in rows], np.uint8)
+    stamp = np.arange(1.0, 26.0, dtype=np.float32).reshape(5, 5)
+    band = np.zeros((19, 23), np.float32)
+    stamp_events(x, y, on, stamp, band)
+    np.testing.assert_array_equal(band, naive_vision.stamp_events(rows, stamp.tolist(), 19, 23))
+
+
+def test_the_sharpness_that_events_keep_up_to_date_is_that_of_their_image() -> None:
+    rng = np.random.default_rng(3)
+    x, y = rng.integers(0, 60, 2000).astype(np.uint16), rng.integers(0, 50, 2000).astype(np.uint16)
+    on = rng.integers(0, 2, 2000).astype(np.uint8)
+    energy = EventEnergy(50, 60, 14)
+    energy.add(x[:700], y[:700], on[:700])
+    energy.add(x[700:], y[700:], on[700:])
+    image = np.zeros((50, 60), np.float32)
+    np.add.at(image, (y, x), 2.0 * on - 1.0)
+    expected = band_energy(image, BANDS_PX[0], np.ones_like(image), 14)
+    assert energy.measure() == pytest.approx(np.log(expected), abs=1e-4)
+
+
+def test_a_band_passes_white_noise_as_its_gain_says() -> None:
+    noise = np.random.default_rng(4).standard_normal((400, 400)).astype(np.float32)
+    for scale_px in BANDS_PX:
+        assert band_energy(noise, scale_px, np.ones_like(noise), 14) == pytest.approx(band_gain(scale_px), rel=0.02)
 
 
 def test_the_vertex_is_exact_on_a_parabola_however_lopsided_the_record() -> None:

@@ -108,6 +108,35 @@ def test_frames_are_the_best_witness() -> None:
     assert found.focus.contributions[0][0] == "frames"
 
 
+def test_a_first_frame_without_structure_is_not_the_end() -> None:
+    world = sweep(seed=7, size=SIZE, end_um=90.0, frame_every_us=2_000)
+    dark = replace(world, frames=[(world.frames[0][0], np.zeros_like(world.frames[0][1])), *world.frames[1:]])
+    found = searched(dark)
+    assert found.outcome is Outcome.FOCUSED
+    assert abs(error_um(found, world)) < 0.6
+    blank = replace(world, frames=[(t_us, np.full_like(pixels, 90)) for t_us, pixels in world.frames])
+    assert "frames" not in [one[0] for one in searched(blank).focus.contributions]
+    few = {name: getattr(world, name)[:500] for name in ("t_us", "x", "y", "on")}
+    assert searched(replace(blank, **few)).outcome is Outcome.NO_TEXTURE
+
+
+def test_frames_of_what_no_event_has_seen_are_no_evidence() -> None:
+    world = sweep(seed=7, size=SIZE, end_um=90.0, frame_every_us=2_000)
+    kept = world.t_us < 5_000
+    columns = {name: getattr(world, name)[kept] for name in ("t_us", "x", "y", "on")}
+    late = [(t_us if t_us < 5_000 else t_us + 60_000, pixels) for t_us, pixels in world.frames]
+    assert searched(replace(world, frames=late, **columns)).outcome is not Outcome.FOCUSED
+
+
+def test_a_focus_that_was_passed_on_the_first_way_lay_ahead() -> None:
+    world = sweep(seed=7, size=SIZE, end_um=90.0, frame_every_us=2_000)
+    found = searched(replace(world, on=1 - world.on))
+    assert found.outcome is Outcome.FOCUSED
+    assert found.direction is Direction.APPROACHING
+    away = sweep(seed=7, size=SIZE, start_um=40.0, end_um=200.0, frame_every_us=2_000)
+    assert searched(away).direction is Direction.RECEDING
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_moving_away_is_receding_and_no_focus(seed: Any) -> None:
     found = searched(sweep(seed=seed, size=SIZE, start_um=40.0, end_um=200.0), reference=start_picture(seed, 40.0))

@@ -88,6 +88,59 @@ def test_stamps_that_step_back_are_sorted_and_reported(tmp_path: Any) -> None:
     assert "stepped back" in sweep.warnings[0]
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ROI selected: (2, 12, 4, 18)",
+        "ROI selected: [2, 12, 4, 18]",
+        "roi = 2 12 4 18",
+        "ROI selected: (2.0, 12.0, 4.0, 18.0)",
+        "ROI selected: (np.int64(2), np.int64(12), np.int64(4), np.int64(18))\r",
+    ],
+)
+def test_the_region_is_found_however_it_was_printed(folder: Any, line: Any) -> None:
+    (folder / "info.txt").write_text(f"start_timestamp = 0\n{line}\ndelta_t = 1500\n")
+    sweep = read_sweep(folder)
+    assert sweep.roi == Roi(4, 2, 14, 10)
+    assert sweep.bin_us == 1500
+    assert sweep.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"), [("(2, 12, 4)", "not four numbers"), ("none", "not four"), ("(-2, 9, 4, 18)", "does not fit")]
+)
+def test_a_region_that_cannot_be_used_is_reported(folder: Any, line: Any, reason: Any) -> None:
+    (folder / "info.txt").write_text(f"ROI selected: {line}\n")
+    sweep = read_sweep(folder)
+    assert sweep.roi == Roi(0, 0, 20, 16)
+    assert reason in sweep.warnings[0]
+
+
+def test_a_frame_is_named_by_its_time_whole_or_not(folder: Any) -> None:
+    frames = folder / "davis_frames_50"
+    (frames / "0020000.png").rename(frames / "20000.25.png")
+    (frames / "0100000.png").rename(frames / "1.000000e+05.png")
+    cv2.imwrite(str(frames / "mean.png"), np.zeros((16, 20), np.uint8))
+    assert [frame.t_us for frame in read_sweep(folder).frames] == [0, 20001, 100000]
+
+
+def test_frames_of_another_time_are_reported(folder: Any) -> None:
+    np.save(folder / "event.npy", structured(t=T + 200_000))
+    assert "none of the 3 frames (0 .. 100000 us)" in read_sweep(folder).warnings[0]
+    np.save(folder / "event.npy", structured())
+    assert read_sweep(folder).warnings == ()
+
+
+def test_seconds_are_not_taken_for_microseconds(tmp_path: Any) -> None:
+    t = np.linspace(0.0, 1.0, 1001)
+    x = np.zeros(t.size, int)
+    np.savez(tmp_path / "seconds.npz", t=t, x=x, y=x, p=x)
+    with pytest.raises(FormatError, match="probably seconds"):
+        read_sweep(tmp_path / "seconds.npz")
+    np.savez(tmp_path / "fractions.npz", t=1e6 * t + 0.25, x=x, y=x, p=x)
+    assert read_sweep(tmp_path / "fractions.npz").t_us[-1] == 1_000_000
+
+
 def test_a_region_that_does_not_fit_is_reported_and_not_used(folder: Any) -> None:
     (folder / "info.txt").write_text("ROI selected: (0, 400, 0, 400)")
     sweep = read_sweep(folder)

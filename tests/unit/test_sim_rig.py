@@ -153,7 +153,7 @@ def test_every_board_turns_the_lens(board: str) -> None:
         ({"scene": "moon"}, r"sim\.scene is 'moon'"),
         ({"motion": "wobble"}, r"sim\.motion is 'wobble'"),
         ({"camera": "evk9"}, r"sim\.camera is 'evk9'; known: evk4, davis346"),
-        ({"board": "abacus"}, r"sim\.board is 'abacus'; known: tic, grbl, tmcl, avr, zaber"),
+        ({"board": "abacus"}, r"sim\.board is 'abacus'; known: tic, grbl, avr, tmcl, zaber"),
         ({"width": 2000}, r"sim\.width, sim\.height are 2000, 720"),
         ({"start_um": 2400.0}, r"sim\.start_um is 2400, too far"),
         ({"brightness": 0.0}, r"sim\.brightness"),

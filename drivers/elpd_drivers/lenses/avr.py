@@ -127,8 +127,8 @@ class AvrController:
 
     @property
     def trouble_bytes(self) -> bytes:
-        """A halt; the controller itself says whether its count still has an origin."""
-        return wire.HALT
+        """A halt, and the driver off: with it the controller forgets its reference."""
+        return wire.HALT + self.last_resort
 
     @property
     def capabilities(self) -> LensCapabilities:

@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 
 HALT, BRAKE = b"\xf1", b"\xf2"
-_ESCAPE, _START, _END = 0xFD, 0xFE, 0xFF
+_ESCAPE, _START, END = 0xFD, 0xFE, 0xFF
 _CONTROL, _FLIP = 0xF0, 0x20
 
 VERSION = 1
@@ -54,7 +54,7 @@ def encode(sequence: int, command: int, payload: bytes = b"") -> bytes:
             out += bytes((_ESCAPE, byte ^ _FLIP))
         else:
             out.append(byte)
-    out.append(_END)
+    out.append(END)
     return bytes(out)
 
 
@@ -96,7 +96,7 @@ class Frames:
                 self._held.clear()
             elif not self._framing:
                 continue
-            elif byte == _END:
+            elif byte == END:
                 self._framing = False
                 reply = _parse(bytes(self._held))
                 if reply is None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from elpd.errors import LensError
 from elpd.motion.trajectory import REST, Motion
 from elpd.records import CommandStamp, LensFlag, LensReport, StopMode
-from elpd.units import NS_PER_US, HostNs, after_ms
+from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
 from elpd_drivers.lenses.axis import check_speed, check_target, run_target
 from elpd_drivers.lenses.line import Trouble
 
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 STOPS_TRIED = 3
 STOP_GRACE_MS = 20.0
+LOOK_AHEAD_NS = 2 * NS_PER_MS
+"""What a question and its answer take on the wire, and a little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,10 +286,20 @@ class DirectLens:
         reading = self._controller.read(now)
         report = None if reading is None else self._take(reading, fuse=fuse)
         asking.check(now, " and the controller's settings")
-        if asking.due(now):
+        if self._due(now):
             self._controller.ask(self._clock.now_ns())
             asking.asked(now)
         return report
+
+    def _due(self, now: int) -> bool:
+        """Ask at regular intervals, and as soon as the motor should rest: then somebody waits for the answer."""
+        asking, look_ns = self._controller.asking, self._motor.look_ns
+        if asking.open or look_ns is None or look_ns - now > LOOK_AHEAD_NS:
+            return asking.due(now)
+        if now < look_ns:
+            return False  # an answer from before the rest would only keep the line from the one after it
+        self._motor.look_ns = None
+        return True
 
     def _take(self, reading: Reading, *, fuse: bool) -> LensReport | None:
         flags = LensFlag.MOVING if reading.moving else LensFlag.NONE

@@ -42,6 +42,9 @@ class Motor:
     ) -> None:
         self.referenced = False
         self.rest_due_ns: int | None = None
+        self.rest_from_ns = 0
+        self.look_ns: int | None = None
+        """When to look whether the motion has ended, ``None`` if nobody waits for that."""
         self.report: LensReport | None = None
         self.newest_command = 0
         self.stops = 0
@@ -87,7 +90,7 @@ class Motor:
         """Note a command that takes effect at *effective_ns*; return the number to amend it by."""
         with self._lock:
             self.newest_command = self._trajectory.command(motion, effective_ns, sigma_ns)
-            self._expect_rest(effective_ns, grace_ms)
+            self._expect_rest(effective_ns, sigma_ns, grace_ms)
             return self.newest_command
 
     def amend(self, number: int, effective_ns: int, sigma_ns: float, *, still_ending: bool = True) -> None:
@@ -95,11 +98,14 @@ class Motor:
         with self._lock:
             self._trajectory.amend(number, effective_ns, sigma_ns)
             if still_ending:
-                self._expect_rest(effective_ns, None)
+                self._expect_rest(effective_ns, sigma_ns, None)
 
-    def _expect_rest(self, effective_ns: int, grace_ms: float | None) -> None:
+    def _expect_rest(self, effective_ns: int, sigma_ns: float, grace_ms: float | None) -> None:
+        """Note when the motion ends by the model, when to look whether it has, and when it must have."""
         grace_ns = self._grace_ns if grace_ms is None else round(grace_ms * NS_PER_MS)
-        self.rest_due_ns = max(self._trajectory.at_rest_from() or effective_ns, effective_ns) + grace_ns
+        self.rest_from_ns = max(self._trajectory.at_rest_from() or effective_ns, effective_ns)
+        self.look_ns = self.rest_from_ns + round(3 * sigma_ns)
+        self.rest_due_ns = self.rest_from_ns + grace_ns
 
     # --- what it reports -------------------------------------------------------------------------------------------
 

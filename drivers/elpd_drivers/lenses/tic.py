@@ -216,7 +216,7 @@ class TicController:
         elif self._motor.rest_due_ns is None:
             steps = [(limit, None), (aim, motion)]
         sent = self._line.send(b"".join(data for data, _ in steps))
-        self._speed_sps, self._halted_softly = speed_sps, False
+        self._speed_sps = speed_sps
         behind = sum(len(data) for data, _ in steps)
         planned: list[tuple[int, Motion]] = []
         for data, then in steps:
@@ -230,7 +230,7 @@ class TicController:
         del sent
         if mode is StopMode.ABRUPT:
             safe = speed_sps * self._settings.um_per_step <= self._settings.start_stop_um_s
-            self._halted_softly = self._motor.referenced and safe
+            self._halted_softly = self._motor.referenced = self._motor.referenced and safe
         return 0
 
     def _prepare(self) -> None:
@@ -313,10 +313,10 @@ class TicController:
         """Confirm the position after a halt that cost no steps; without one, "uncertain" means lost."""
         if not self._status & wire.UNCERTAIN:
             return
-        motor, due = self._motor, self._motor.rest_due_ns
+        motor = self._motor
         if not self._halted_softly:
-            motor.referenced = motor.referenced and due is not None and report.moving
-        elif not report.moving and due is not None and report.earliest_ns > due - 20 * NS_PER_MS:
+            motor.referenced = motor.referenced and motor.rest_due_ns is not None and report.moving
+        elif not report.moving and report.earliest_ns > motor.rest_from_ns:
             self._line.send(self._frame(wire.HALT_AND_SET_POSITION, long_word(self._newest.position)))
             self._halted_softly = False
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import avr, grbl, tic, tmcl, zaber
-from elpd_drivers.lenses.avr_wire import FASTEST_SPS
+from elpd_drivers.lenses import avr, avr_wire, grbl, tic, tmcl, zaber
 from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
@@ -64,15 +63,18 @@ def _told_by_driver(wanted: Wanted) -> Table:
     }
 
 
+def _told_within(fastest_sps: float) -> Callable[[Wanted], Table]:
+    """Return such a table for a controller that makes so many steps a second at the most."""
+
+    def table(wanted: Wanted) -> Table:
+        return {**_told_by_driver(wanted), "max_speed_um_s": min(wanted.speed_um_s, fastest_sps * wanted.um_per_step)}
+
+    return table
+
+
 def _set_up(wanted: Wanted) -> Table:
     """Return the config of a board that keeps speed and acceleration in its own settings."""
     return {"speed_um_s": wanted.speed_um_s, "acceleration_um_s2": wanted.acceleration_um_s2}
-
-
-def _as_fast_as_an_avr(wanted: Wanted) -> Table:
-    """Return the same, at no more than our own controller's fastest."""
-    fastest_um_s = FASTEST_SPS * wanted.um_per_step
-    return {**_told_by_driver(wanted), "max_speed_um_s": min(wanted.speed_um_s, fastest_um_s)}
 
 
 CONTROLLERS: Mapping[str, Controller] = {
@@ -80,8 +82,8 @@ CONTROLLERS: Mapping[str, Controller] = {
     "grbl": Controller(
         GRBL, grbl.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step, "trust_position": True}
     ),
+    "avr": Controller(AVR, avr.open_lens, _nothing, _told_within(avr_wire.FASTEST_SPS)),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
-    "avr": Controller(AVR, avr.open_lens, _nothing, _as_fast_as_an_avr),
     "zaber": Controller(ZABER, zaber.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step}),
 }
 

@@ -79,6 +79,8 @@ class AvrBoard:
         self._cycles = (ctypes.c_uint64 * ROOM)()
         self._bytes = (ctypes.c_uint8 * ROOM)()
         self._ways = (ctypes.c_int32 * ROOM)()
+        self._speaking = bytearray()
+        self._spoke_ns = begin_ns
         self._output: deque[tuple[int, bytes]] = deque()
         self._now_ns = begin_ns
         self._boot_ns = float(begin_ns)
@@ -124,6 +126,10 @@ class AvrBoard:
         self.advance_to(at_ns)
         self._bench.bench_reset(self._handle)
         self._turn()
+
+    def alarm_at(self, at_ns: int) -> None:
+        """Let it meet what it has instead of alarms: a reset by its own watchdog."""
+        self.reset_at(at_ns)
 
     @property
     def steps_made(self) -> int:
@@ -188,7 +194,24 @@ class AvrBoard:
     def _listen(self) -> None:
         count = self._bench.bench_sent(self._handle, self._cycles, self._bytes, ROOM)
         for index in range(count):
-            self._output.append((self._time_of(self._cycles[index]), bytes((self._bytes[index],))))
+            if not self._speaking:
+                self._spoke_ns = self._time_of(self._cycles[index])
+            self._speaking.append(self._bytes[index])
+            if self._bytes[index] == wire.END:  # frames leave whole: the UART sends their bytes without a pause
+                self._output.append((self._spoke_ns, bytes(self._speaking)))
+                self._speaking.clear()
+
+
+def hindrance() -> str | None:
+    """Return what stands in the way of building the firmware, with what to do; ``None``: nothing."""
+    if not FIRMWARE.is_dir():
+        return f"{FIRMWARE} is missing: the firmware's sources come with a checkout, not with an installation"
+    missing = [tool for tool in ("avr-gcc", "gcc", "make") if shutil.which(tool) is None]
+    if not Path("/usr/include/simavr").is_dir():
+        missing.append("simavr's headers")
+    if missing:
+        return f"the firmware cannot be built without {', '.join(missing)}; apt-get install make gcc {PACKAGES}"
+    return None
 
 
 @cache
@@ -197,11 +220,9 @@ def built() -> tuple[Path, Path]:
 
     Raises ``LensError`` if the sources or the compilers are missing, or a build fails, with what to do.
     """
-    if not FIRMWARE.is_dir():
-        raise LensError(f"{FIRMWARE} is missing: the firmware's sources come with a checkout, not with an installation")
-    missing = [tool for tool in ("avr-gcc", "gcc", "make") if shutil.which(tool) is None]
-    if missing:
-        raise LensError(f"cannot build the firmware without {', '.join(missing)}; apt-get install make gcc {PACKAGES}")
+    reason = hindrance()
+    if reason is not None:
+        raise LensError(reason)
     digest = hashlib.sha3_224()
     for source in sorted([*FIRMWARE.glob("*.[ch]"), FIRMWARE / "Makefile"]):
         digest.update(source.read_bytes())
