@@ -110,6 +110,23 @@ DIALECTS = {
 }
 
 
+def _zaber_lie(data: bytes) -> bytes:
+    if b" 3200:" not in data:
+        return data
+    lie = data.decode("ascii").split(":")[0].replace(" 3200", " 900")
+    return f"{lie}:{-sum(lie[1:].encode('ascii')) & 255:02X}\r\n".encode("ascii")
+
+
+DIALECTS["zaber"] = Dialect(
+    4.0,
+    abrupt_keeps_reference=False,
+    moves=lambda data: b" move " in data,
+    lie=_zaber_lie,
+    question=b"/1 1 07 get pos",
+    spoil=lambda data: data.replace(b" OK ", b" OJ ") if data.startswith(b"@") else data,
+)
+
+
 @dataclass
 class Rig:
     kind: str

@@ -41,7 +41,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--board", default="tic", choices=["tic", "grbl"])
+    parser.add_argument("--board", default="tic", choices=["tic", "grbl", "tmcl", "zaber", "avr"])
     parser.add_argument("--camera", default="evk4", choices=["evk4", "davis346"])
     parser.add_argument("--motion", default="static", choices=["static", "moderate", "violent", "shake"])
     parser.add_argument("--start-um", type=float, nargs="+", default=[-200.0, 200.0], help="starts beside true focus")

@@ -31,7 +31,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 @config_options
 @json_option
 def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
-    """Serve a simulated BOARD (grbl, tic, ...) on a pty until interrupted.
+    """Serve a simulated BOARD (grbl, tic, tmcl, zaber, ...) on a pty until interrupted.
 
     Its settings are given as --set board.KEY=VALUE: what the lens is like (travel_um, backlash_um, start_um, ...) and
     how the board is set up (referenced, baud, ...). From the configuration it takes sim.seed and lens.um_per_step.

@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from elpd_drivers.lenses.grbl_lines import LineReader, jog_line, parse_status
+from elpd_drivers.lenses.grbl_lines import jog_line, parse_status
+from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.sim.boards import grbl_text
 from hypothesis import given
 from hypothesis import strategies as st

@@ -14,6 +14,7 @@ import pytest
 import serial
 import ticlib
 from elpd_drivers.lenses.serial_port import SerialPort
+from elpd_drivers.sim.boards.line import PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
 from lens_rigs import KINDS, SPEED_SPS, served
 from virtual import MonotonicClock
@@ -31,9 +32,9 @@ CLOCK = MonotonicClock()
 PATIENT = {"reply_ms": 2000.0}
 
 
-def open_lens(kind: str, port: str) -> Any:
+def open_lens(kind: str, port: str, **settings: Any) -> Any:
     more = {"trust_position": True, "connect_ms": 20_000.0} if kind == "grbl" else {}
-    return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more}, CLOCK, None)
+    return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more, **settings}, CLOCK, None)
 
 
 def poll_until(lens: Any, condition: Callable[[Any], bool], limit_s: float = 20.0) -> Any:
@@ -102,6 +103,47 @@ def test_unplugging_is_an_error_that_says_so(kind: str, board: Any) -> None:
         poll_until(lens, lambda _: False)
     with pytest.raises(LensError, match="gone"):
         lens.poll()
+    lens.close()
+
+
+def test_a_run_over_a_pty_reverses_and_ends_by_itself(kind: str, board: Any) -> None:
+    if kind == "avr":
+        pytest.skip("the firmware under simavr falls behind the wall clock where the machine is busy")
+    server, _ = board
+    lens = open_lens(kind, server.port)
+    lens.run(SPEED_SPS / 8, after_ms(CLOCK.now_ns(), 60_000))
+    going_up = poll_until(lens, lambda report: report.moving and report.steps > 3210)
+    lens.run(-SPEED_SPS / 8, after_ms(CLOCK.now_ns(), 500))
+    turned = poll_until(lens, lambda report: report.steps < going_up.steps - 20)
+    assert turned.steps > 0
+    poll_until(lens, lambda report: not report.moving)
+    lens.close()
+
+
+def test_what_comes_back_on_another_pty_can_be_opened_and_is_where_it_was(kind: str, board: Any) -> None:
+    server, motor = board
+    lens = open_lens(kind, server.port)
+    lens.move_to(Steps(3300), SPEED_SPS)
+    poll_until(lens, lambda report: not report.moving and abs(report.steps - 3300) < 2)
+    server.close()
+    with pytest.raises(LensError, match="gone"):
+        poll_until(lens, lambda _: False)
+    lens.close()
+    again = PtyServer(server.wire.board)
+    lens = open_lens(kind, again.port)
+    assert motor.rotor_at(CLOCK.now_ns()) == pytest.approx(3300)
+    report = poll_until(lens, lambda report: not report.moving)
+    assert report.steps == pytest.approx(3300, abs=2)
+    lens.close()
+    again.close()
+
+
+def test_nothing_but_garbage_over_a_pty_is_an_error(kind: str, board: Any) -> None:
+    server, _ = board
+    lens = open_lens(kind, server.port, reply_ms=1000.0)
+    server.wire.faults.garble = lambda data: b"\xa5" * len(data)
+    with pytest.raises(LensError, match="limit"):
+        poll_until(lens, lambda _: False)
     lens.close()
 
 
@@ -199,7 +241,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["marlin"], "known are avr, grbl, tic, tmcl"),
+        (["marlin"], "known are avr, grbl, tic, tmcl, zaber"),
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),

@@ -48,7 +48,7 @@ def test_a_lens_that_does_not_answer_is_an_error_and_is_told_to_stop(board: str,
     assert story.truth.mechanism.velocity_at(story.ended_ns + 100_000_000) == 0.0
 
 
-@pytest.mark.parametrize("board", ["tic", "grbl"])
+@pytest.mark.parametrize("board", ["tic", "grbl", "tmcl", "zaber"])
 def test_a_board_that_resets_in_the_middle_of_a_sweep_is_an_error(board: str) -> None:
     story = play(f"sim.board={board}", "sim.seed=3", events=[Event("sweep", 20.0, _reset)])
     assert isinstance(story.error, LensError)

@@ -28,8 +28,10 @@ def picture(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("board", ["tic", "grbl"])
-@pytest.mark.parametrize("start_um", [-200.0, 200.0])
+@pytest.mark.parametrize(
+    ("board", "start_um"),
+    [("tic", -200.0), ("tic", 200.0), ("grbl", -200.0), ("grbl", 200.0), ("tmcl", 200.0), ("zaber", -200.0)],
+)
 def test_focused(board: str, start_um: float) -> None:
     story = play(f"sim.board={board}", f"sim.start_um={start_um}", "sim.seed=3")
     assert story.outcome is Outcome.FOCUSED

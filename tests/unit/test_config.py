@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from elpd import rig
 from elpd.config import Config, load
-from elpd.errors import ConfigError, ElpdError
+from elpd.errors import ConfigError, ElpdError, LensError
+from elpd.timebase import MonotonicClock
 
 CONFIGS = Path(__file__).parents[2] / "config"
 
@@ -15,6 +17,12 @@ def test_without_a_file_the_rig_is_the_simulated_one() -> None:
     config = load()
     assert config.rig == "sim"
     assert config == Config()
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*-*.toml")), ids=lambda path: path.name)
+def test_a_shipped_rigs_lens_table_is_one_that_its_driver_reads(path: Path) -> None:
+    with pytest.raises(LensError, match="no such port"):
+        rig._open_lens(load(path).lens, MonotonicClock())
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.name)

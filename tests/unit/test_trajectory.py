@@ -133,7 +133,13 @@ def test_the_same_calls_give_the_same_bits() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "live_rms_um", "late_rms_um", "rest_um"),
-    [("tic", 0.1, 0.1, 0.1), ("grbl", 1.0, 0.4, 0.6), ("tmcl", 0.4, 0.3, 0.1)],
+    [
+        ("tic", 0.1, 0.1, 0.1),
+        ("grbl", 1.0, 0.4, 0.6),
+        ("tmcl", 0.4, 0.3, 0.1),
+        ("zaber", 0.4, 0.3, 0.1),
+        ("avr", 0.7, 0.6, 0.1),
+    ],
 )
 def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms_um: float, rest_um: float) -> None:
     assert kind in KINDS
@@ -206,9 +212,12 @@ def test_it_stays_honest_under_any_commands(kind: str) -> None:
             what = choose.choice(["run", "run", "move", "stop"])
             if what == "run":
                 way = choose.choice([-1, 1])
-                made.lens.run(way * choose.uniform(2000, 20_000), made.soon(choose.uniform(50, 400)))
+                speed_sps = min(choose.uniform(2000, 20_000), made.lens.limits.max_speed_sps)
+                made.lens.run(way * speed_sps, made.soon(choose.uniform(50, 400)))
             elif what == "move":
-                made.lens.move_to(choose.randint(500, 7500), choose.uniform(2000, 30_000))
+                made.lens.move_to(
+                    choose.randint(500, 7500), min(choose.uniform(2000, 30_000), made.lens.limits.max_speed_sps)
+                )
             else:
                 made.lens.stop(StopMode.RAMPED)
             made.live(choose.uniform(5, 250), ask)

@@ -39,6 +39,10 @@ SWITCH_STEPS = 32
 SETTLING_SPS = 2000.0
 """A rotor takes a single step at about this speed, however slowly the next one comes."""
 
+START_STEPS, TURN_STEPS = 2.0, 6.0
+"""How far its ramps lag behind the ideal, from rest and through rest: their first steps are single ones. One standard
+deviation, seen on the firmware; reports soon tell how far it truly is."""
+
 TRIES = 3
 """How often a command is sent before its silence is a fault."""
 
@@ -79,7 +83,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: AvrSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.0))
+        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=4.5))
         return DirectLens(
             AvrController(table, clock, line, motor, latency), line, motor, clock, latency, poll_ms=table.query_ms
         )
@@ -202,15 +206,22 @@ class AvrController:
         frame = wire.encode(sequence, wire.GO, wire.go(target, speed_sps))
         self._unconfirmed = (sequence, frame, self._motor.stops, 1)
         sent = self._line.send(frame)
-        motion = Motion(self.limits.acceleration_sps2, target_steps=float(target), speed_sps=speed_sps)
+        strays = TURN_STEPS if self._motor.under_way else START_STEPS
+        motion = Motion(
+            self.limits.acceleration_sps2,
+            target_steps=float(target),
+            speed_sps=speed_sps,
+            rounding_steps=strays,
+        )
         return Going(sent.begun_ns, sent.done_ns, [(sent.off_wire_ns, motion)])
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
         """Let what was not obeyed yet be forgotten; a halt from too high a speed costs steps, and the reference."""
         del sent
         self._unconfirmed = None
         if mode is StopMode.ABRUPT and speed_sps * self._settings.um_per_step > self._settings.start_stop_um_s:
             self._motor.referenced = False
+        return 0
 
     # --- homing ----------------------------------------------------------------------------------------------------
 

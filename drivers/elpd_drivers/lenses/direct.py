@@ -10,6 +10,7 @@ What differs between such controllers is their wire protocol and the truth about
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
@@ -124,8 +125,11 @@ class Controller(Protocol):
         """Command an absolute target under a speed limit, whatever is under way."""
         ...
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
-        """Note that a stop has left, at a speed of *speed_sps*. Called from any thread."""
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
+        """Note that a stop has left, at a speed of *speed_sps*; return how much later than usual it may bite, in ns.
+
+        Called from any thread.
+        """
         ...
 
     def begin_homing(self) -> None:
@@ -237,10 +241,11 @@ class DirectLens:
         effective = sent.off_wire_ns + self._latency.usual_ns
         if self._motor.known:
             _, velocity_sps = self._motor.state_at(effective)
-            self._controller.stopped(mode, sent, abs(velocity_sps))
+            half_ns = self._controller.stopped(mode, sent, abs(velocity_sps)) // 2
             ramped = mode is StopMode.RAMPED or self._controller.abrupt_is_ramped
             motion = Motion(self.limits.acceleration_sps2, rounding_steps=0.3) if ramped else REST
-            self._motor.command(motion, effective, self._latency.sigma_ns, grace_ms=STOP_GRACE_MS)
+            sigma_ns = math.hypot(self._latency.sigma_ns, half_ns)
+            self._motor.command(motion, effective + half_ns, sigma_ns, grace_ms=STOP_GRACE_MS)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 
     def poll(self) -> LensReport | None:
@@ -324,10 +329,8 @@ class DirectLens:
             return
         if motor.stops_ignored > STOPS_TRIED:
             self._line.send(self._controller.last_resort)
-            raise Trouble(
-                f"the motor still runs at {report.velocity_sps or 0.0:.0f} steps/s after {STOPS_TRIED} stops; its "
-                "driver was switched off"
-            )
+            speed = "" if report.velocity_sps is None else f" at {report.velocity_sps:.0f} steps/s"
+            raise Trouble(f"the motor still runs{speed} after {STOPS_TRIED} stops; its driver was switched off")
         self._line.send(self._controller.stop_bytes[StopMode.ABRUPT])
 
     def _flagged(self, report: LensReport) -> LensReport:

@@ -32,12 +32,12 @@ from elpd_drivers.lenses.grbl_lines import (
     ERROR_WORDS,
     RESET,
     STATUS,
-    LineReader,
     Status,
     jog_line,
     parse_status,
 )
 from elpd_drivers.lenses.line import Trouble, open_on_line
+from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from elpd.errors import ConfigError, LensError
 from elpd.units import after_ms
 from elpd_drivers.lenses.axis import limits_from
-from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, LineReader, Status, parse_status
+from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, Status, parse_status
+from elpd_drivers.lenses.lines import LineReader
 
 if TYPE_CHECKING:
     from elpd.ports import Clock

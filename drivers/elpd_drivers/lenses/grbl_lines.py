@@ -1,4 +1,4 @@
-"""The lines of GRBL 1.1: splitting, status reports, jogs, and what its numbers mean. Pure functions and one buffer."""
+"""The lines of GRBL 1.1: status reports, jogs, and what its numbers mean. Pure functions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass
 
 STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
-MAX_LINE = 512
 ERROR_WORDS = {
     "1": "expected a letter",
     "2": "bad number",
@@ -56,23 +55,3 @@ def parse_status(line: str) -> Status | None:
 def jog_line(x_mm: float, feed_mm_min: float) -> bytes:
     """Return a jog to an absolute machine position, in mm and mm/min whatever the board's modal state."""
     return f"$J=G21G90G53X{x_mm:.5f}F{feed_mm_min:.3f}\n".encode("ascii")
-
-
-class LineReader:
-    """Cuts what arrives into lines; what is not ASCII or too long is not a line."""
-
-    def __init__(self) -> None:
-        self._partial = bytearray()
-
-    def feed(self, data: bytes) -> list[tuple[str, int]]:
-        """Return the lines that are complete now, without their ends, each with the number of bytes after it."""
-        self._partial += data
-        lines: list[tuple[str, int]] = []
-        while (end := self._partial.find(b"\n")) >= 0:
-            raw = bytes(self._partial[:end]).strip(b"\r\n\0 ")
-            del self._partial[: end + 1]
-            if raw and raw.isascii():
-                lines.append((raw.decode("ascii"), len(self._partial)))
-        if len(self._partial) > MAX_LINE:
-            self._partial.clear()
-        return lines

@@ -225,12 +225,13 @@ class TicController:
                 planned.append((sent.off_wire_ns - behind * self._line.byte_ns, then))
         return Going(sent.begun_ns, sent.done_ns, planned)
 
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
         """Remember whether the halt came from a speed at which it costs no steps."""
         del sent
         if mode is StopMode.ABRUPT:
             safe = speed_sps * self._settings.um_per_step <= self._settings.start_stop_um_s
             self._halted_softly = self._motor.referenced = self._motor.referenced and safe
+        return 0
 
     def _prepare(self) -> None:
         """Clear what keeps an idle Tic from moving: its command timeout and the safe start that follows."""

@@ -27,6 +27,7 @@ from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.direct import DirectLens, Going, Latency, Reading
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.motor import Motor
+from elpd_drivers.lenses.tmcl_talk import LOOK_MS, Talk, TmclSettings, identify, learn_units, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,38 +36,7 @@ if TYPE_CHECKING:
     from elpd.records import LensReport
     from elpd_drivers.lenses.line import Line, Sent
 
-IDENTIFICATIONS = 3
 REFERENCED_MARK, MARK_VARIABLE = 0x454C_5044, 55
-_LOOK_MS = 0.25
-
-
-@dataclass(frozen=True, slots=True)
-class TmclSettings:
-    """The table ``[lens]`` for a TMCL module.
-
-    ``address`` is the module's, ``host`` the one that it replies to, ``motor`` the axis. ``module`` is needed only for
-    a module that this driver does not know by number. ``home_um_s`` and ``switch_um_s`` are the speeds of the search
-    for the left switch and of leaving it. ``latency_us`` is the usual time from a command's last bit to its effect,
-    adapter included, and ``latency_sigma_us`` how well that is known; unless given, a real port gets what USB needs.
-    """
-
-    port: str = ""
-    baud: int = 115_200
-    address: int = 1
-    host: int = 2
-    motor: int = 0
-    module: int = 0
-    um_per_step: float = 0.3125
-    min_um: float = 0.0
-    max_um: float = 2500.0
-    max_speed_um_s: float = 12_000.0
-    acceleration_um_s2: float = 200_000.0
-    home_um_s: float = 1000.0
-    switch_um_s: float = 125.0
-    query_ms: float = 5.0
-    reply_ms: float = 60.0
-    latency_us: float = 250.0
-    latency_sigma_us: float = 100.0
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> DirectLens:
@@ -77,7 +47,8 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: TmclSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=1.0, ramp_steps=0.3))
+        timing = Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns // 2, quantum_steps=1.0, ramp_steps=0.3)
+        motor = Motor(timing)
         controller = TmclController(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms)
 
@@ -100,22 +71,23 @@ class TmclController:
             settings.acceleration_um_s2,
         )
         self.limits = self._wanted
+        self._talk = Talk(settings, clock, line)
         self.asking = Asking(settings.query_ms, settings.reply_ms)
-        stop = self._frame(wire.MST)
+        stop = self._talk.frame(wire.MST)
         self._stopping = {StopMode.ABRUPT: stop, StopMode.RAMPED: stop}
-        abort = self._frame(wire.RFS, wire.STOP) + stop
+        abort = self._talk.frame(wire.RFS, wire.STOP) + stop
         self._aborting = {StopMode.ABRUPT: abort, StopMode.RAMPED: abort}
         self.stop_bytes: Mapping[StopMode, bytes] = self._stopping
-        self.last_resort = self._frame(wire.SAP, wire.RUN_CURRENT) + self._frame(wire.SAP, wire.STANDBY_CURRENT)
+        self.last_resort = self._talk.frame(wire.SAP, wire.RUN_CURRENT) + self._talk.frame(
+            wire.SAP, wire.STANDBY_CURRENT
+        )
         self._exchange_ns = 2 * wire.FRAME * line.byte_ns + latency.usual_ns + 4 * latency.sigma_ns
         self.command_ns = 3 * self._exchange_ns
         self._units = wire.Units()
-        self._replies = wire.Replies(settings.address, settings.host)
-        # the question in flight, those that follow it, and stops that were not acknowledged yet
+        # the question in flight, and those that follow it
         self._waiting: _Question | None = None
         self._round: deque[_Question] = deque()
         self._rounds = 0
-        self._stops_open = 0
         self._stop_first_ns = self._stop_sent_ns = 0
         self._speed_units = 0
         self._speed_sps = 0.0
@@ -126,7 +98,7 @@ class TmclController:
     @property
     def trouble_bytes(self) -> bytes:
         """Stop, and take the mark away: the next session must home."""
-        return self.stop_bytes[StopMode.ABRUPT] + self._frame(wire.SGP, MARK_VARIABLE, 0, motor=wire.USER_BANK)
+        return self.stop_bytes[StopMode.ABRUPT] + self._talk.frame(wire.SGP, MARK_VARIABLE, 0, motor=wire.USER_BANK)
 
     @property
     def capabilities(self) -> LensCapabilities:
@@ -145,11 +117,10 @@ class TmclController:
 
     def connect(self) -> None:
         """Identify the module, stop it if it moves, learn its units, and set its acceleration."""
-        self._identify()
-        self._line.send(self._frame(wire.RFS, wire.STOP))
-        self._answer(wire.RFS)
-        self._exchange(wire.MST)
-        self._units = self._learn_units()
+        identify(self._talk)
+        self._talk.attempt(wire.RFS, wire.STOP)
+        self._talk.exchange(wire.MST)
+        self._units = learn_units(self._talk)
         wanted, units = self._wanted, self._units
         if not units.fits(wanted.max_speed_sps, wanted.acceleration_sps2):
             raise ConfigError(
@@ -160,8 +131,8 @@ class TmclController:
             )
         self._speed_units = units.speed(wanted.max_speed_sps)
         acceleration = units.acceleration(wanted.acceleration_sps2)
-        self._exchange(wire.SAP, wire.MAX_ACCELERATION, acceleration)
-        self._exchange(wire.SAP, wire.MAX_SPEED, self._speed_units)
+        self._talk.exchange(wire.SAP, wire.MAX_ACCELERATION, acceleration)
+        self._talk.exchange(wire.SAP, wire.MAX_SPEED, self._speed_units)
         self.limits = LensLimits(
             wanted.min_steps,
             wanted.max_steps,
@@ -169,95 +140,26 @@ class TmclController:
             acceleration * units.acceleration_sps2,
         )
         due = after_ms(self._clock.now_ns(), 20 * self._settings.reply_ms)
-        while self._exchange(wire.GAP, wire.SPEED):
+        while self._talk.exchange(wire.GAP, wire.SPEED):
             if self._clock.now_ns() >= due:
                 raise LensError(f"lens port {self._line.name}: the motor does not stop; switch the module off and on")
-        self._marked = self._exchange(wire.GGP, MARK_VARIABLE, motor=wire.USER_BANK) == REFERENCED_MARK
+        self._marked = self._talk.exchange(wire.GGP, MARK_VARIABLE, motor=wire.USER_BANK) == REFERENCED_MARK
 
     def referenced(self) -> bool:
         """Whether the mark of an earlier homing is still there: the module had power ever since."""
         return self._marked
 
-    def _identify(self) -> None:
-        """See that a TMCL stepper module answers; what another session had asked for may arrive first."""
-        known, seen = wire.STEPPER_MODULES | {self._settings.module}, b""
-        for _ in range(IDENTIFICATIONS):
-            self._line.read()
-            self._line.send(self._frame(wire.GET_VERSION))
-            due, seen = after_ms(self._clock.now_ns(), self._settings.reply_ms), b""
-            firmware = None
-            while firmware is None and self._clock.now_ns() < due:
-                seen += self._line.read()
-                firmware = wire.parse_version(seen, self._settings.host)
-                self._clock.sleep_until(after_ms(self._clock.now_ns(), _LOOK_MS))
-            if firmware is None:
-                continue
-            if firmware.module in known:
-                return
-            raise LensError(
-                f"lens port {self._line.name}: module {firmware.module} with firmware {firmware.version} answered, "
-                f"which is not known as a stepper module; if it is one, set lens.module = {firmware.module}"
-            )
-        raise LensError(
-            f"lens port {self._line.name}: no answer from a TMCL module within {self._settings.reply_ms:.0f} ms "
-            f"(received {seen[:40]!r}); check power, cable, baud ({self._settings.baud}), lens.address "
-            f"({self._settings.address}) and lens.host ({self._settings.host})"
-        )
-
-    def _learn_units(self) -> wire.Units:
-        """Ask for the divisors of a TMC429; modules without them count in pulses per second."""
-        pulse = self._try(wire.GAP, wire.PULSE_DIVISOR)
-        if pulse.status != wire.OK:
-            return wire.Units()
-        return wire.Units(pulse.value, self._exchange(wire.GAP, wire.RAMP_DIVISOR))
-
-    # --- one command, one reply ------------------------------------------------------------------------------------
-
-    def _frame(self, command: int, kind: int = 0, value: int = 0, *, motor: int | None = None) -> bytes:
-        settings = self._settings
-        return wire.request(settings.address, command, kind, settings.motor if motor is None else motor, value)
-
-    def _exchange(self, command: int, kind: int = 0, value: int = 0, *, motor: int | None = None) -> int:
-        """Send a command, wait for its reply, and return its value. Raises ``Trouble`` if it is refused or lost."""
-        reply = self._try(command, kind, value, motor=motor)
-        if reply.status != wire.OK:
-            words = wire.STATUS_WORDS.get(reply.status, "unknown")
-            raise Trouble(
-                f"the module refused command {command}, type {kind}, value {value} with status {reply.status} "
-                f"({words}); compare its axis parameters with the config"
-            )
-        return reply.value
-
-    def _try(self, command: int, kind: int = 0, value: int = 0, *, motor: int | None = None) -> wire.Reply:
-        self._line.send(self._frame(command, kind, value, motor=motor))
-        return self._answer(command)
-
-    def _answer(self, command: int) -> wire.Reply:
-        due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
-        while True:
-            for reply, _ in self._replies.feed(self._line.read()):
-                if reply.command == command:
-                    return reply
-                self._heed_stop(reply)
-            now = self._clock.now_ns()
-            if now >= due:
-                raise Trouble(
-                    f"no reply to command {command} for {self._settings.reply_ms:.0f} ms; check the cable, or raise "
-                    "lens.reply_ms"
-                )
-            self._clock.sleep_until(after_ms(now, _LOOK_MS))
-
     def _settle(self) -> None:
         """Wait until nothing is in flight, or what is must be taken for lost."""
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms / 4)
         self._round.clear()
-        while self._waiting is not None or self._stops_open > 0:
+        while self._waiting is not None or self._talk.stops_open > 0:
             self._take(self._clock.now_ns())
             now = self._clock.now_ns()
             if now >= due:
                 break
-            self._clock.sleep_until(after_ms(now, _LOOK_MS))
-        self._waiting, self._stops_open = None, 0
+            self._clock.sleep_until(after_ms(now, LOOK_MS))
+        self._waiting, self._talk.stops_open = None, 0
         self.asking.answered()
 
     # --- motion ----------------------------------------------------------------------------------------------------
@@ -286,37 +188,33 @@ class TmclController:
         else:
             steps = [(limit, None), (aim, motion)]
         planned: list[tuple[int, Motion]] = []
-        done = begun
+        done, stops = begun, self._motor.stops
         for command, then in steps:
-            sent = self._line.send(self._frame(*command))
-            self._expect(command[0])
+            if self._motor.stops != stops:
+                break  # one came while the first reply was awaited
+            sent = self._line.send(self._talk.frame(*command))
+            self._talk.confirm(command[0])
             done = sent.done_ns
             if then is not None:
                 planned.append((sent.off_wire_ns, then))
         self._speed_units = units
         return Going(begun, done, planned)
 
-    def _expect(self, command: int) -> None:
-        reply = self._answer(command)
-        if reply.status != wire.OK:
-            words = wire.STATUS_WORDS.get(reply.status, "unknown")
-            raise Trouble(f"the module refused command {command} with status {reply.status} ({words}); home it again")
-
-    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> None:
-        """Remember that an acknowledgement is due."""
+    def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
+        """Remember that an acknowledgement is due; the module may finish the reply before it first."""
         del mode, speed_sps
-        self._stops_open += 1
+        self._talk.stops_open += 1
         self._stop_first_ns = self._stop_sent_ns = sent.off_wire_ns
-
-    def _heed_stop(self, reply: wire.Reply) -> None:
-        if reply.command == wire.MST and self._stops_open > 0:
-            self._stops_open -= 1
+        if self._waiting is None:
+            return 0
+        reply_out_ns = self._asked_off_ns + self._latency.usual_ns + wire.FRAME * self._line.byte_ns
+        return max(0, reply_out_ns - sent.off_wire_ns)
 
     def _repeat_stop(self, now_ns: int) -> None:
         """Send an unacknowledged stop again, when its reply and the one before it should have come."""
-        if self._stops_open > 0 and now_ns - self._stop_sent_ns > 2 * self._exchange_ns:
+        if self._talk.stops_open > 0 and now_ns - self._stop_sent_ns > 2 * self._exchange_ns:
             sent = self._line.send(self.stop_bytes[StopMode.RAMPED])
-            self._stops_open, self._stop_sent_ns = 1, sent.off_wire_ns
+            self._talk.stops_open, self._stop_sent_ns = 1, sent.off_wire_ns
             # it may have been any of them
             half_ns = (sent.off_wire_ns - self._stop_first_ns) // 2
             effective_ns = self._stop_first_ns + half_ns + self._latency.usual_ns
@@ -330,7 +228,7 @@ class TmclController:
         settings = self._settings
         towards = self._units.speed(settings.home_um_s / settings.um_per_step)
         away = self._units.speed(settings.switch_um_s / settings.um_per_step)
-        self._exchange(wire.SGP, MARK_VARIABLE, 0, motor=wire.USER_BANK)
+        self._talk.exchange(wire.SGP, MARK_VARIABLE, 0, motor=wire.USER_BANK)
         for kind, value in (
             (wire.RIGHT_SWITCH_OFF, 0),
             (wire.LEFT_SWITCH_OFF, 0),
@@ -338,10 +236,10 @@ class TmclController:
             (wire.SEARCH_SPEED, towards),
             (wire.SWITCH_SPEED, away),
         ):
-            self._exchange(wire.SAP, kind, value)
+            self._talk.exchange(wire.SAP, kind, value)
         self._marked = False
         self.stop_bytes = self._aborting
-        self._exchange(wire.RFS, wire.START)
+        self._talk.exchange(wire.RFS, wire.START)
         self._searching = True
         self.asking.soon()
 
@@ -353,7 +251,7 @@ class TmclController:
         """Leave the mark."""
         self._settle()
         self.stop_bytes = self._stopping
-        self._exchange(wire.SGP, MARK_VARIABLE, REFERENCED_MARK, motor=wire.USER_BANK)
+        self._talk.exchange(wire.SGP, MARK_VARIABLE, REFERENCED_MARK, motor=wire.USER_BANK)
         self._marked = True
 
     # --- queries and replies ---------------------------------------------------------------------------------------
@@ -379,31 +277,28 @@ class TmclController:
         return self._ready.popleft() if self._ready else None
 
     def _take(self, now_ns: int) -> None:
-        for reply, behind in self._replies.feed(self._line.read()):
+        for reply, behind in self._talk.replies():
             if self._waiting is None or reply.command != self._waiting.command:
-                self._heed_stop(reply)  # or late, or a duplicate: its instant of sampling is unknown
+                self._talk.heed(reply)  # or late, or a duplicate: its instant of sampling is unknown
                 continue
             ended_ns = now_ns - behind * self._line.byte_ns
             if ended_ns < self._asked_off_ns + wire.FRAME * self._line.byte_ns:
                 continue  # so soon it cannot be the answer: replies do not say which parameter they are of
             question, self._waiting = self._waiting, None
             if reply.status != wire.OK:
-                raise Trouble(
-                    f"the module refused a question (command {question.command}, type {question.kind}) with status "
-                    f"{reply.status} ({wire.STATUS_WORDS.get(reply.status, 'unknown')}); check lens.motor"
-                )
+                raise refusal(reply, "check lens.motor")
             self._learn(question, reply.value, ended_ns - wire.FRAME * self._line.byte_ns)
 
     def _go_on(self) -> None:
         """Send the next question, unless a reply is still to come: another command would collide with it."""
-        if self._waiting is not None or self._stops_open > 0:
+        if self._waiting is not None or self._talk.stops_open > 0:
             return
         if not self._round:
             self.asking.answered()
             return
         self._waiting = question = self._round.popleft()
         motor = wire.USER_BANK if question.command in {wire.GGP, wire.SGP} else None
-        sent = self._line.send(self._frame(question.command, question.kind, motor=motor))
+        sent = self._line.send(self._talk.frame(question.command, question.kind, motor=motor))
         self._asked_off_ns = sent.off_wire_ns
 
     def _learn(self, question: _Question, value: int, latest_ns: int) -> None:

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import avr, avr_wire, grbl, tic, tmcl
+from elpd_drivers.lenses import avr, avr_wire, grbl, tic, tmcl, zaber
 from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
 from elpd_drivers.sim.boards.tic import BOARD as TIC
 from elpd_drivers.sim.boards.tmcl import BOARD as TMCL
+from elpd_drivers.sim.boards.zaber import BOARD as ZABER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -83,6 +84,7 @@ CONTROLLERS: Mapping[str, Controller] = {
     ),
     "avr": Controller(AVR, avr.open_lens, _nothing, _told_within(avr_wire.FASTEST_SPS)),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
+    "zaber": Controller(ZABER, zaber.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step}),
 }
 
 
