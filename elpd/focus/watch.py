@@ -36,7 +36,7 @@ from elpd.vision.track import FrameEnergy, PeakTrack
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi
+    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi, SensorProfile
     from elpd.vision.reference import Reference
 
 REST_WINDOW_US = 1000
@@ -103,6 +103,8 @@ class Watch:
         Lens position in um at a sensor time.
     rereference
         Makes weights of a newer frame, for cameras that have frames.
+    sensor
+        What a calibration knows of the sensor.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Watch:
         settings: WatchSettings,
         locate: Callable[[SensorUs], float],
         rereference: Rereference | None = None,
+        sensor: SensorProfile | None = None,
     ) -> None:
         self._reference = reference
         self.roi = roi
@@ -125,14 +128,17 @@ class Watch:
         )
         inside = np.zeros((geometry.height, geometry.width), np.bool_)
         inside[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width] = True
+        for x, y in sensor.hot_pixels if sensor is not None else ():
+            inside[y, x] = False
         self._inside = inside
+        self._sensor = sensor
         self._resting = ElpWindows(reference.weights, inside, window_us=REST_WINDOW_US, rate_cap=True)
         self._rest_sums = [0, 0, 0]  # elp, events, us
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
         self._detector = Detector()
         self._decoder = PacketDecoder(geometry)
-        self._memory = EventMemory(roi, geometry)
+        self._memory = EventMemory(roi, geometry, sensor=sensor)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         self._gaps_us: list[int] = []
@@ -182,7 +188,7 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry)
+        self._memory = EventMemory(self.roi, self._geometry, sensor=self._sensor)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from elpd.records import SensorProfile
+
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
@@ -47,6 +49,9 @@ VERTEX_IN_MOTION = 0.12
 
 LAG_UNEXPLAINED = 0.5
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
+
+OTHER_LIGHT = 0.5
+"""How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
 
 ASTRAY = 0.3
 """Share of stray pairs at which nothing that was measured on pairs is believed any more."""
@@ -122,6 +127,25 @@ class Lag:
     at: float = 0.0
     sigma: float = 0.0
     typical: float = 0.0
+    calibrated: bool = False
+    """Whether a calibration stands behind it, so that ``sigma`` holds all that is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagPrior:
+    """What a calibration says of ``Lag.at``, one standard error, and what a lag may be that nobody has measured."""
+
+    at: float
+    sigma: float
+    unmeasured: float
+
+    @classmethod
+    def of(cls, sensor: SensorProfile | None, speed_um_us: float) -> LagPrior | None:
+        """Return how far a lens goes, at a speed, during a calibrated lag; ``None`` without one."""
+        if sensor is None or sensor.lag_us is None or sensor.lag_sigma_us is None or speed_um_us <= 0.0:
+            return None
+        sigma_us = max(1.0, float(np.hypot(sensor.lag_sigma_us, OTHER_LIGHT * sensor.lag_us)))
+        return cls(sensor.lag_us * speed_um_us, sigma_us * speed_um_us, UNMEASURED_LAG_US * speed_um_us)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +176,8 @@ class EventWitnesses:
         # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
         stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
         # The lag was measured on the pairs: as far as they are astray, it was not.
-        shared = float(np.hypot(shared, min(1.0, stray / ASTRAY) * unmeasured_lag))
+        if not self.lag.calibrated:
+            shared = float(np.hypot(shared, min(1.0, stray / ASTRAY) * unmeasured_lag))
         if self.vertex is not None:
             sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
             found.append(Witness("vertex", self.vertex.at, sigma, shared))
@@ -163,21 +188,29 @@ class EventWitnesses:
 
 
 def ask_events(
-    events: EventStretch, begin: float, peak: float, end: float, brightness: NDArray[np.float32] | None = None
+    events: EventStretch,
+    begin: float,
+    peak: float,
+    end: float,
+    brightness: NDArray[np.float32] | None = None,
+    *,
+    mismatch: float = MISMATCH,
+    calibrated: LagPrior | None = None,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find the vertex near *peak*, and the mirror pairs.
 
     *brightness*, (height, width) of the cut-out, relative to the brightest parts, tells how slow each pixel's
     photoreceptor is; with it, the pairs themselves measure the lag, and both witnesses are freed of it.
+    *mismatch* is the thresholds' relative spread over pixels, *calibrated* what a calibration says of the lag.
     """
     pixels = max(1, events.height * events.width)
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     weight, slowness = _by_brightness(brightness, events)
-    vertex, level_at_peak = _vertex(events, ticks, peak, weight)
-    pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness)
+    vertex, level_at_peak = _vertex(events, ticks, peak, weight, mismatch)
+    pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness, calibrated)
     if lag.at > 0.0 and vertex is not None:
         quick = replace(events, position=events.position - lag.at * slowness[events.y, events.x])
-        corrected, _ = _vertex(quick, ticks, peak, weight)
+        corrected, _ = _vertex(quick, ticks, peak, weight, mismatch)
         vertex = corrected or vertex
     return EventWitnesses(vertex, pairs, lag)
 
@@ -195,9 +228,9 @@ def _by_brightness(
 
 
 def _vertex(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
+    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32], mismatch: float
 ) -> tuple[Vertex | None, NDArray[np.float32]]:
-    curve, level_at_peak = _rebuilt_curve(events, ticks, peak, weight)
+    curve, level_at_peak = _rebuilt_curve(events, ticks, peak, weight, mismatch)
     end = float(ticks[-1])
     wide = fit_vertex(ticks, curve, end - float(ticks[0]))
     vertex = None
@@ -244,7 +277,7 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
 
 
 def _rebuilt_curve(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
+    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32], mismatch: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     pixels = events.height * events.width
     pixel = events.y.astype(np.int64) * events.width + events.x
@@ -252,18 +285,23 @@ def _rebuilt_curve(
     level = np.zeros((ticks.size, pixels), dtype=np.float32)
     squares = np.zeros((ticks.size, 2))
     rebuild_levels(starts, order, events.position, events.on, ticks, level, squares)
-    mismatch = MISMATCH**2 * squares.sum(axis=1) / pixels
+    pattern = mismatch**2 * squares.sum(axis=1) / pixels
     images = level.reshape(ticks.size, events.height, events.width)
     curve = np.zeros(ticks.size)
     for band in BANDS_PX:
         energy = np.array([band_energy(image, band, weight, events.margin) for image in images])
-        energy = np.maximum(energy - band_gain(band) * mismatch, 1e-3 * energy)
+        energy = np.maximum(energy - band_gain(band) * pattern, 1e-3 * energy)
         curve += np.log(energy + 1e-12) / len(BANDS_PX)
     return curve, images[int(np.argmin(np.abs(ticks - peak)))]
 
 
 def _pair_mode(
-    events: EventStretch, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
+    events: EventStretch,
+    level: NDArray[np.float32],
+    peak: float,
+    end: float,
+    slowness: NDArray[np.float64],
+    calibrated: LagPrior | None,
 ) -> tuple[Mode | None, Lag]:
     shape = (events.height, events.width)
     pairs = find_pairs(events.t_us, events.x, events.y, events.on, events.position, shape)
@@ -279,7 +317,7 @@ def _pair_mode(
     mode = weighted_mode(middle, weights, 0.15 * past)
     if mode is None or not slowness.any():
         return mode, Lag()
-    return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past)
+    return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past, calibrated)
 
 
 def without_lag(
@@ -288,11 +326,13 @@ def without_lag(
     slowness: NDArray[np.float64],
     mode: Mode,
     width: float,
+    calibrated: LagPrior | None = None,
 ) -> tuple[Mode, Lag]:
     """Fit ``middle = focus + lag·slowness`` robustly (Tukey's biweight around the mode); the lag is not negative.
 
     A lag that is not significant is shrunk by its own error, so that a scene without bright and dark pixels keeps its
-    mode and gains nothing but an honest error.
+    mode and gains nothing but an honest error. With a *calibrated* lag the two are averaged by their errors instead,
+    and pairs that disagree among themselves say less.
     """
     focus, lag = mode.at, 0.0
     design = np.stack([np.ones_like(slowness), slowness], axis=1)
@@ -312,6 +352,19 @@ def without_lag(
     typical = float(np.average(slowness, weights=biweight))
     kept = lag**2 / (lag**2 + sigma_lag**2) if lag > 0.0 else 0.0
     centre = focus + lag * typical
+    if calibrated is not None:
+        stray = min(1.0, max(0.0, _STATIC_SHARE - mode.share) / ASTRAY)
+        precisions = (
+            1.0 / max(np.hypot(sigma_lag, stray * calibrated.unmeasured), 1e-12) ** 2,
+            1.0 / calibrated.sigma**2,
+        )
+        lag = float(np.average([lag, calibrated.at], weights=precisions))
+        sigma_lag = float(1.0 / np.sqrt(sum(precisions)))
+        at_centre = np.array([1.0, typical])
+        sigma = float(np.sqrt(max(at_centre @ covariance @ at_centre, 0.0)))  # the lag's own error is shared by all
+        return Mode(centre - lag * typical, sigma, mode.count, mode.share), Lag(
+            lag, sigma_lag, typical, calibrated=True
+        )
     answer = centre - kept * lag * typical
     sigma = float(np.hypot(np.sqrt(max(covariance[0, 0], 0.0)), (1.0 - kept) * max(lag, 0.0) * typical))
     return Mode(answer, sigma, mode.count, mode.share), Lag(kept * lag, sigma_lag, typical)

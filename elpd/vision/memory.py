@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
+from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, LagPrior, ask_events
 from elpd.vision.filters import PixelCap
-from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.integral import BANDS_PX, MISMATCH, band_gain
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry, Roi
+    from elpd.records import Geometry, Roi, SensorProfile
     from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.ruler import Ruler
 
@@ -55,14 +55,22 @@ class EventMemory:
         Where to focus, and on what sensor.
     max_events:
         How many are kept.
+    sensor:
+        What a calibration knows: hot pixels are not heard, lag and mismatch not guessed.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS) -> None:
+    def __init__(
+        self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS, sensor: SensorProfile | None = None
+    ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         height, width = self._bottom - self._top, self._right - self._left
         self._cap = PixelCap(height, width)
+        self._sensor = sensor
+        for x, y in sensor.hot_pixels if sensor is not None else ():
+            if self._left <= x < self._right and self._top <= y < self._bottom:
+                self._cap.silence(x - self._left, y - self._top)
         self._energy = EventEnergy(height, width, ROI_MARGIN_PX)
         self._shape = (height, width)
         self._columns = _columns(FIRST_CAPACITY)
@@ -169,7 +177,10 @@ class EventMemory:
         if brightness is not None:
             brightness = np.ascontiguousarray(brightness[self._top : self._bottom, self._left : self._right])
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
-        return ask_events(events, flank, peak, now, brightness)
+        sensor = self._sensor
+        mismatch = MISMATCH if sensor is None or sensor.mismatch is None else sensor.mismatch
+        calibrated = LagPrior.of(sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0)
+        return ask_events(events, flank, peak, now, brightness, mismatch=mismatch, calibrated=calibrated)
 
     def witnesses(
         self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None

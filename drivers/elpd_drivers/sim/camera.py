@@ -115,6 +115,7 @@ class SimulatedCamera:
         jitter: np.random.Generator,
         frames: ApsFrames | None = None,
         mask_slots: int = 64,
+        serial: str = "simulated",
         ring_packets: int = RING_PACKETS,
         faults: CameraFaults | None = None,
     ) -> None:
@@ -127,6 +128,8 @@ class SimulatedCamera:
         self._jitter = jitter
         self._frames = frames
         self._mask_slots = mask_slots
+        self.serial = serial
+        """Which of all simulated cameras this is (``elpd.ports.Identified``)."""
         self._ring_packets = ring_packets
         self._faults = faults or CameraFaults()
         self._ring: deque[_Sent] = deque()
