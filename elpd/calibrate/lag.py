@@ -44,7 +44,7 @@ REACH_DOF = 3.0
 """Pairs this far from the mode, in depths of focus, are looked at; the fit gives those that disagree less say."""
 
 MODE_DOF = 0.5
-LAW = 0.15
+LAW = 0.5
 """Relative error of the lag that scatter does not show: a photoreceptor follows the light of the moment, which changes
 with defocus, a peak as short as the lag is passed on flattened, and how dark current bounds the lag is not known. As
 large as the scatter about the simulator's truth over scenes, thresholds and seeds (``tools/calibration.py``)."""
