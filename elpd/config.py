@@ -80,6 +80,15 @@ class JournalSection(_Section):
     """How much may wait in memory while the lens moves; past it the run's journal ends, marked truncated."""
 
 
+class StateSection(_Section):
+    """What a rig has found out about itself: calibration profiles."""
+
+    directory: Path | None = None
+    """Where profiles lie; ``$XDG_STATE_HOME/elpd``, mostly ``~/.local/state/elpd``, unless given."""
+    profiles: bool = True
+    """Whether profiles that belong to this rig are used."""
+
+
 class SimSection(_Section):
     """The simulated rig. Everything is drawn from ``seed``; a set key wins over the draw."""
 
@@ -105,6 +114,7 @@ class Config(_Section):
     aperture: DeviceSection = DeviceSection()
     focus: FocusSection = FocusSection()
     journal: JournalSection = JournalSection()
+    state: StateSection = StateSection()
     sim: SimSection = SimSection()
 
 

@@ -203,6 +203,16 @@ class Latency(Protocol):
 
 
 @runtime_checkable
+class Identified(Protocol):
+    """A camera that knows which one of its kind it is."""
+
+    @property
+    def serial(self) -> str:
+        """The serial number."""
+        ...
+
+
+@runtime_checkable
 class Closeable(Protocol):
     """Anything to give back at the end."""
 

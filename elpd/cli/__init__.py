@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import io
 import sys
-from typing import cast
+from typing import ClassVar, cast
 
 import click
 
@@ -19,6 +19,7 @@ from elpd.cli.common import report_error
 from elpd.errors import ElpdError
 
 COMMANDS = {
+    "calibrate": "measure the rig itself: sensor",
     "check": "what is installed, what is plugged in, and does it work",
     "decode": "what an event file holds",
     "demo": "focus the embedded simulated rig, live in the terminal",
@@ -36,25 +37,28 @@ COMMANDS = {
 
 
 class LazyGroup(click.Group):
-    """A group whose commands live in ``elpd.cli.<name>`` and are imported on demand."""
+    """A group whose commands live in ``elpd.cli.<prefix><name>`` and are imported on demand."""
+
+    table: ClassVar[dict[str, str]] = COMMANDS
+    prefix: ClassVar[str] = ""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Name every command, without importing any."""
         del ctx
-        return sorted(COMMANDS)
+        return sorted(self.table)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import the command's module and return its ``command``."""
-        if cmd_name not in COMMANDS:
-            ctx.fail(f"there is no command {cmd_name!r}; there are {', '.join(sorted(COMMANDS))}")
-        module = importlib.import_module(f"elpd.cli.{cmd_name.replace('-', '_')}")
+        if cmd_name not in self.table:
+            ctx.fail(f"there is no command {cmd_name!r}; there are {', '.join(sorted(self.table))}")
+        module = importlib.import_module(f"elpd.cli.{self.prefix}{cmd_name.replace('-', '_')}")
         return cast("click.Command", module.command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands from the table, so that help stays light."""
         del ctx
         with formatter.section("Commands"):
-            formatter.write_dl(sorted(COMMANDS.items()))
+            formatter.write_dl(sorted(self.table.items()))
 
 
 @click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})

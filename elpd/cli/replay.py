@@ -53,10 +53,15 @@ def run_cycle(parts: RigParts, run: RecordedRun, sink: RunSink, cancelled: Calla
 
 def _request(run: RecordedRun) -> FocusRequest:
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
-    from elpd.records import Roi  # noqa: PLC0415
+    from elpd.records import Roi, SensorProfile  # noqa: PLC0415
 
     asked = FocusRequest(**run.request)
-    return replace(asked, roi=Roi(**run.request["roi"]) if asked.roi else None, reference=run.attachment("reference"))
+    sensor = None
+    if asked.sensor is not None:
+        known = dict(run.request["sensor"])
+        sensor = SensorProfile(**known | {"hot_pixels": tuple((x, y) for x, y in known["hot_pixels"])})
+    roi = Roi(**run.request["roi"]) if asked.roi else None
+    return replace(asked, roi=roi, reference=run.attachment("reference"), sensor=sensor)
 
 
 def _fields(run: RecordedRun, report: ReplayReport) -> dict[str, Any]:

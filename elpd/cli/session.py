@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import structlog
 
 from elpd import rig
+from elpd.calibrate.sensor import sensor_in_use
 from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
@@ -76,6 +77,8 @@ def focus_on(
         here_um = parts.scale.to_um(parts.lens.position_at(parts.clock.now_ns()).steps)
         depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um
         stored_map.load(request.reference).check(parts.camera.geometry, here_um, depth_of_focus_um, time.time())
+    if request.sensor is None:
+        request = replace(request, sensor=sensor_in_use(config, parts.camera))
     with RunWriter.begin(config, request, parts) as run:
         settings = CycleSettings.from_config(config)
         cycle = FocusCycle(run.parts, settings, request, run, observer, run.watch(cancelled))

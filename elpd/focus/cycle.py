@@ -23,7 +23,7 @@ from elpd.focus.picture import Picture
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
 from elpd.focus.watch import Watch, WatchSettings
-from elpd.ports import Biases, HardwareRoi
+from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
     BiasSet,
     FocusEstimate,
@@ -228,6 +228,9 @@ class FocusCycle:
             camera.apply_biases(BiasSet.FOCUS)
         if isinstance(camera, HardwareRoi):
             camera.set_window(widened(roi, ROI_MARGIN_PX, geometry.width, geometry.height))
+        sensor = self._request.sensor
+        if sensor is not None and sensor.hot_pixels and isinstance(camera, PixelMask):
+            self._details["masked_pixels"] = camera.set_mask(sensor.hot_pixels)
         self._stage.wait_ms(BIAS_SETTLE_MS)
         watch = Watch(
             reference,
@@ -236,6 +239,7 @@ class FocusCycle:
             WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=frames),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
+            sensor,
         )
         self._watch = watch
         self._stage.listener = watch.rest

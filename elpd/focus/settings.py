@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from elpd.config import Config
-    from elpd.records import Roi
+    from elpd.records import Roi, SensorProfile
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,10 @@ class FocusRequest:
     """One request.
 
     The picture to focus on is the file ``reference`` (an image of the whole sensor, or a stored map), or, without one,
-    what the aperture's opening or the newest frame shows.
+    what the aperture's opening or the newest frame shows. ``sensor`` is what a calibration knows of this camera.
     """
 
     roi: Roi | None = None
     reference: Path | None = None
     dry_run: bool = False
+    sensor: SensorProfile | None = None

@@ -40,7 +40,7 @@ from elpd.vision.whole_periods import WholePeriods
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi
+    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi, SensorProfile
     from elpd.vision.flicker import Flicker
     from elpd.vision.reference import Reference
 
@@ -112,6 +112,8 @@ class Watch:
         Lens position in um at a sensor time.
     rereference
         Makes weights of a newer frame, for cameras that have frames.
+    sensor
+        What a calibration knows of the sensor.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class Watch:
         settings: WatchSettings,
         locate: Callable[[SensorUs], float],
         rereference: Rereference | None = None,
+        sensor: SensorProfile | None = None,
     ) -> None:
         self._reference = reference
         self.roi = roi
@@ -134,7 +137,10 @@ class Watch:
         )
         inside = np.zeros((geometry.height, geometry.width), np.bool_)
         inside[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width] = True
+        for x, y in sensor.hot_pixels if sensor is not None else ():
+            inside[y, x] = False
         self._inside = inside
+        self._sensor = sensor
         self.resting = Resting(roi, geometry)
         """What the sensor says at rest."""
         self.rate = RateWatch()
@@ -145,7 +151,7 @@ class Watch:
         self._rest = RestingRate()
         self._detector = Detector()
         self._decoder = PacketDecoder(geometry)
-        self._memory = EventMemory(roi, geometry)
+        self._memory = EventMemory(roi, geometry, sensor=sensor)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         self._gaps_us: list[int] = []
@@ -212,7 +218,7 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot)
+        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, sensor=self._sensor)
         if self._lamp is not None:
             self._periods = WholePeriods(self.resting.heard & ~self.resting.hot, at_us)
             self._undone = np.zeros(self._inside.shape, np.int32)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.record.layouts import RecordedSweep
-    from elpd.records import ElpSample, Roi
+    from elpd.records import ElpSample, Roi, SensorProfile
     from elpd.vision.ruler import Ruler
 
 _PIECE = 1 << 18
@@ -89,6 +89,8 @@ class SweepSearch:
         Earlier events are not part of the sweep.
     reference:
         A picture that is there from the start.
+    sensor:
+        What a calibration knows of the sensor.
     """
 
     def __init__(
@@ -100,6 +102,7 @@ class SweepSearch:
         depth_of_focus_um: float | None = None,
         begin_us: int | None = None,
         reference: Reference | None = None,
+        sensor: SensorProfile | None = None,
     ) -> None:
         self._sweep = sweep
         self._roi = roi
@@ -111,12 +114,14 @@ class SweepSearch:
         if self._depth_of_focus_um is not None:
             windows = WindowsByTravel(ruler, TRAVEL_PER_DEPTH_OF_FOCUS * self._depth_of_focus_um)
         cap = PixelCap(sweep.geometry.height, sweep.geometry.width)
+        for x, y in sensor.hot_pixels if sensor is not None else ():
+            cap.silence(x, y)
         self._meter = Meter(roi, windows, self._begin_us, ruler, cap)
         self._detector = Detector()
         self._frames = PeakTrack()
         self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX)
         self._first = int(np.searchsorted(sweep.t_us, self._begin_us, side="left"))
-        self._memory = EventMemory(roi, sweep.geometry)
+        self._memory = EventMemory(roi, sweep.geometry, sensor=sensor)
         self._attempts = 0
         self._attempts_until = 0
         self._width: float | None = None

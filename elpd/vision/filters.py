@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 CAP_EVENTS = 8
 CAP_DECAY_US = 5_000
+_FOR_EVER_US = 1 << 62
 
 
 @kernel("int64(int64[::1], uint16[::1], uint16[::1], int64[:, ::1], int64[:, ::1], int64, int64, uint8[::1])")
@@ -65,6 +66,10 @@ class PixelCap:
         self._last_us = np.zeros((height, width), dtype=np.int64)
         self._burst = burst
         self._decay_us = decay_us
+
+    def silence(self, x: int, y: int) -> None:
+        """Refuse every event of a pixel from now on."""
+        self._debt_us[y, x] = _FOR_EVER_US
 
     def keep(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """Return which of the events (in time order) pass."""

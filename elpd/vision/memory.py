@@ -23,7 +23,7 @@ from elpd.vision.track import EventEnergy, PeakTrack
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry, Roi
+    from elpd.records import Geometry, Roi, SensorProfile
     from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.ruler import Ruler
@@ -59,16 +59,27 @@ class EventMemory:
         How many are kept.
     hot:
         (height, width) of the sensor: pixels not to listen to.
+    sensor:
+        What a calibration knows: hot pixels are not heard, the lag is not guessed.
     """
 
     def __init__(
-        self, roi: Roi, geometry: Geometry, max_events: int = MAX_EVENTS, hot: NDArray[np.bool_] | None = None
+        self,
+        roi: Roi,
+        geometry: Geometry,
+        max_events: int = MAX_EVENTS,
+        hot: NDArray[np.bool_] | None = None,
+        sensor: SensorProfile | None = None,
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         height, width = self._bottom - self._top, self._right - self._left
         self._cap = PixelCap(height, width)
+        self._sensor = sensor
+        for x, y in sensor.hot_pixels if sensor is not None else ():
+            if self._left <= x < self._right and self._top <= y < self._bottom:
+                self._cap.silence(x - self._left, y - self._top)
         self._energy = EventEnergy(height, width, ROI_MARGIN_PX)
         self._shape = (height, width)
         self._columns = _columns(FIRST_CAPACITY)

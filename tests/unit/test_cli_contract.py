@@ -45,6 +45,7 @@ FOCUS = _words(
     "outcome reason reversals focus_um sigma_um stop_um final_um stop_latency_us duration_ms phases events lost truth"
 )
 TRUTH = {"focus_um", "estimate_error_um", "stop_error_um", "final_error_um"}
+GROUPS = {"calibrate": ("calibrate", "sensor")}
 OUTCOMES = {outcome.value for outcome in Outcome}
 
 
@@ -149,7 +150,7 @@ def test_a_run_of_focus_can_be_replayed_and_read_as_a_sweep(elpd: Callable[..., 
 
 def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer]) -> None:
     for name in COMMANDS:
-        told = elpd(name, "--help")
+        told = elpd(*GROUPS.get(name, (name,)), "--help")
         assert told.code == 0
         for option in ("--json", "--config", "--set"):
             assert option in told.out, (name, option)
@@ -161,7 +162,7 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
 @pytest.mark.parametrize(
     ("arguments", "code", "kind", "told"),
     [
-        (["serve"], 2, "UsageError", "there is no command 'serve'; there are check, decode"),
+        (["serve"], 2, "UsageError", "there is no command 'serve'; there are calibrate, check"),
         ([], 2, "UsageError", "No such option"),
         (["focus", "--foregruond"], 2, "UsageError", "No such option"),
         (["focus"], 4, "BusyError", "no daemon answers"),

@@ -137,6 +137,7 @@ class SimulatedCamera:
         jitter: np.random.Generator,
         frames: ApsFrames | None = None,
         mask_slots: int = 64,
+        serial: str = "simulated",
         ring_packets: int = RING_PACKETS,
         rate_limit: RateLimit | None = None,
         faults: CameraFaults | None = None,
@@ -150,6 +151,8 @@ class SimulatedCamera:
         self._jitter = jitter
         self._frames = frames
         self._mask_slots = mask_slots
+        self.serial = serial
+        """Which of all simulated cameras this is (``elpd.ports.Identified``)."""
         self._ring_packets = ring_packets
         self._rate_limit = rate_limit or RateLimit()
         self._faults = faults or CameraFaults()

@@ -30,7 +30,7 @@ from elpd_drivers.sim.motion import SceneMotion
 from elpd_drivers.sim.optics import LAMP_SHAPES, DefocusStack, Lamp, Layer, LightField
 from elpd_drivers.sim.retina import OVEREXPOSED, ApsFrames, Retina
 from elpd_drivers.sim.scene import choose_scene, scene_canvas
-from elpd_drivers.sim.sensor import FOCUS, HOT_PIXEL_HZ, BiasLevels, EventSensor
+from elpd_drivers.sim.sensor import FOCUS, HOT_PIXEL_HZ, LAG_US_AT_FULL, MISMATCH_SD, BiasLevels, EventSensor
 from elpd_drivers.sim.world import World, random_stream
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ ROOM_UM = 300.0
 CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
 MASK_SLOTS = {"evk4": 64, "davis346": 8}
 OBJECT_SCENE = "gravel"
+LARGEST_MISMATCH = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +59,10 @@ class SimSettings:
     ``start_um`` is where the lens begins, relative to true focus. ``scene`` is a name or ``random``, one of the natural
     pictures by seed. ``speed_um_s`` is what the sweep is meant to run at; the lens allows three times as much.
     ``width`` and ``height`` shrink the sensor; 0 is the camera's own size. Rates are per pixel; ``brightness`` scales
-    the light, and with it photoreceptor lag and shot noise. ``cam`` makes the image move by 1 ± that many times as much
-    as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner believes in.
+    the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
+    light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
+    that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
+    believes in.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -103,6 +106,8 @@ class SimSettings:
     contrast_on: float = FOCUS.c_on
     contrast_off: float = FOCUS.c_off
     refractory_us: int = FOCUS.refractory_us
+    mismatch: float = MISMATCH_SD
+    lag_us: float = LAG_US_AT_FULL
     memories: bool = True
     ring_packets: int = RING_PACKETS
     # aperture
@@ -314,6 +319,11 @@ def _geometry(chosen: SimSettings) -> Geometry:
             f"sim.width, sim.height are {geometry.width}, {geometry.height}; a simulated {chosen.camera} has 16 to "
             f"{full.width} columns and 16 to {full.height} rows"
         )
+    if chosen.lag_us <= 0 or not 0 <= chosen.mismatch <= LARGEST_MISMATCH:
+        raise ConfigError(
+            f"sim.lag_us is {chosen.lag_us:g} and must be more than 0; sim.mismatch is {chosen.mismatch:g} and must "
+            f"lie in 0 to {LARGEST_MISMATCH:g}, or some pixels would have no threshold"
+        )
     if chosen.depth_of_focus_um <= 0 or chosen.brightness <= 0:
         raise ConfigError("sim.depth_of_focus_um and sim.brightness must be more than 0; use sim.cap for darkness")
     if chosen.flicker_shape not in LAMP_SHAPES or not 0 <= chosen.flicker_depth <= 1:
@@ -379,6 +389,8 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         leak_hz=chosen.leak_hz,
         hot_pixels=chosen.hot_pixels,
         hot_pixel_hz=chosen.hot_pixel_hz,
+        mismatch=chosen.mismatch,
+        lag_us=chosen.lag_us,
         focus=BiasLevels(chosen.contrast_on, chosen.contrast_off, chosen.refractory_us),
         memories=chosen.memories,
     )
@@ -396,6 +408,7 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         jitter=random_stream(seed, "usb"),
         frames=frames,
         mask_slots=MASK_SLOTS[chosen.camera],
+        serial=f"simulated-{seed}",
         ring_packets=chosen.ring_packets,
         rate_limit=RateLimit(chosen.rate_limit_mev_s, told=chosen.rate_limit_told),
         faults=CameraFaults(

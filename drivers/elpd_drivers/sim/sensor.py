@@ -81,6 +81,12 @@ class EventSensor:
         Draws what happens: noise.
     noise_hz, leak_hz
         Rates per pixel.
+    hot_pixel_hz
+        How often a hot pixel's comparator trips of itself, before the refractory time thins it.
+    mismatch
+        Standard deviation of the thresholds over pixels, relative; ON and OFF are drawn apart.
+    lag_us
+        Time constant of a photoreceptor at intensity 1; it grows in inverse proportion to the light.
     memories
         Whether pixels begin focusing with the memories of a running sensor, or all freshly reset.
     """
@@ -96,6 +102,8 @@ class EventSensor:
         leak_hz: float = 0.1,
         hot_pixels: int = 0,
         hot_pixel_hz: float = HOT_PIXEL_HZ,
+        mismatch: float = MISMATCH_SD,
+        lag_us: float = LAG_US_AT_FULL,
         focus: BiasLevels = FOCUS,
         memories: bool = True,
     ) -> None:
@@ -106,6 +114,8 @@ class EventSensor:
         self._noise_hz = noise_hz
         self._leak_hz = leak_hz
         self._hot_pixel_hz = hot_pixel_hz
+        self._mismatch_step = MISMATCH_STEP * (mismatch / MISMATCH_SD)
+        self._lag_us = lag_us
         self._unsettled_since_us = -NEVER_US
         self._unsettled = False
         unit = MISMATCH_SD / MISMATCH_STEP
@@ -182,7 +192,7 @@ class EventSensor:
             np.array_split(log_photocurrent, parts), np.array_split(self._rate, parts), strict=True
         ):
             np.exp(log_rows, out=rows)
-            rows *= np.float32(1 / LAG_US_AT_FULL)
+            rows *= np.float32(1 / self._lag_us)
             np.maximum(rows, np.float32(1 / SLOWEST_LAG_US), out=rows)
         self._gain_fits_us = 0
 
@@ -223,7 +233,7 @@ class EventSensor:
         self._count = step_pixels(
             target.ravel(), self.level.ravel(), self._reference.ravel(), self._gain.ravel(),
             self._window_on.ravel(), self._window_off.ravel(), self._held.ravel(), self._release_us.ravel(),
-            np.float32(biases.c_on), np.float32(biases.c_off), np.float32(MISMATCH_STEP), biases.refractory_us,
+            np.float32(biases.c_on), np.float32(biases.c_off), np.float32(self._mismatch_step), biases.refractory_us,
             begin_us, end_us, self._count, self._out_t, self._out_pixel, self._out_on,
         )  # fmt: skip
 

@@ -1,0 +1,14 @@
+"""What every test may rely on: no profile of the machine's own is in reach."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _no_profiles_of_this_machine(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(nowhere(tmp_path_factory)))
+
+
+def nowhere(factory: pytest.TempPathFactory) -> Path:
+    return factory.getbasetemp() / "state-of-nobody"

@@ -1,0 +1,77 @@
+"""What a profile changes: hot pixels are not heard, the lag is known, the mismatch is the sensor's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from elpd.records import Geometry, Roi, SensorProfile
+from elpd.vision.crossing import LagPrior, without_lag
+from elpd.vision.filters import PixelCap
+from elpd.vision.memory import EventMemory
+from elpd.vision.pairs import Mode, weighted_mode
+
+GEOMETRY = Geometry(64, 48)
+
+
+def test_a_silenced_pixel_never_speaks_again() -> None:
+    cap = PixelCap(4, 4)
+    cap.silence(2, 1)
+    t_us = np.array([0, 10, 10_000_000, 1 << 40, (1 << 40) + 1], np.int64)
+    x, y = np.array([2, 1, 2, 2, 3], np.uint16), np.array([1, 2, 1, 1, 3], np.uint16)
+    assert cap.keep(t_us, x, y).tolist() == [False, True, False, False, True]
+
+
+def test_the_memory_leaves_hot_pixels_of_its_region_out() -> None:
+    roi = Roi(20, 16, 20, 16)
+    sensor = SensorProfile(hot_pixels=((25, 20), (0, 0), (63, 47)))
+    t_us = np.arange(40, dtype=np.int64) * 10_000
+    x = np.where(np.arange(40) % 2, 25, 30).astype(np.uint16)
+    y = np.full(40, 20, np.uint16)
+    on = np.ones(40, np.uint8)
+    kept = []
+    for known in (None, sensor):
+        memory = EventMemory(roi, GEOMETRY, sensor=known)
+        memory.add(t_us, x, y, on)
+        kept.append(memory.capped)
+    assert kept == [0, 20]
+
+
+def crossings(lag_um: float, spread: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mode]:
+    """Pairs of a scene whose pixels are 1 to *spread* times slower than the brightest; focus at 10 um."""
+    random = np.random.default_rng(seed)
+    slowness = random.uniform(1.0, spread, 400)
+    middle = 10.0 + lag_um * slowness + random.normal(0.0, 0.5, 400)
+    weights = np.ones(400)
+    mode = weighted_mode(middle, weights, 5.0)
+    assert mode is not None
+    return middle, weights, slowness, mode
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_calibrated_lag_is_used_where_the_scene_cannot_tell_it(seed: int) -> None:
+    middle, weights, slowness, mode = crossings(2.0, 1.05, seed)
+    prior = LagPrior.of(SensorProfile(lag_us=500.0, lag_sigma_us=20.0), 4e-3)
+    assert prior is not None
+    assert prior.at == pytest.approx(2.0)
+    found, lag = without_lag(middle, weights, slowness, mode, 5.0, prior)
+    blind, _ = without_lag(middle, weights, slowness, mode, 5.0)
+    assert lag.calibrated
+    error_um = np.hypot(found.sigma, lag.sigma * lag.typical)
+    assert abs(found.at - 10.0) < 3 * error_um
+    assert error_um < 1.3  # half of the lag: the light may be another
+    assert abs(found.at - 10.0) < max(abs(blind.at - 10.0), 1.0)
+
+
+def test_a_scene_that_tells_its_lag_outvotes_the_calibration() -> None:
+    middle, weights, slowness, mode = crossings(1.0, 6.0, 1)
+    prior = LagPrior.of(SensorProfile(lag_us=750.0, lag_sigma_us=100.0), 4e-3)
+    found, lag = without_lag(middle, weights, slowness, mode, 5.0, prior)
+    assert lag.at == pytest.approx(1.0, abs=0.1)
+    assert abs(found.at - 10.0) < 3 * np.hypot(found.sigma, lag.sigma * lag.typical)
+
+
+def test_without_a_lag_there_is_no_prior() -> None:
+    assert LagPrior.of(None, 4e-3) is None
+    assert LagPrior.of(SensorProfile(), 4e-3) is None
+    assert LagPrior.of(SensorProfile(lag_us=1.0, lag_sigma_us=1.0), 0.0) is None
