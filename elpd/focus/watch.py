@@ -20,7 +20,6 @@ from elpd.units import SensorUs
 from elpd.vision.crossing import (
     LAG_UNEXPLAINED,
     ROI_MARGIN_PX,
-    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
     Witness,
     frame_witness,
@@ -290,12 +289,11 @@ class Watch:
         if said is None:
             return None
         speed_um_us = 1e-6 * self._settings.speed_um_s
-        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+            for one in said.witnesses(unexplained, width_um)
         ]
         found = fuse([*self._ask_frames(), *witnesses])
         if found is None:
@@ -360,8 +358,8 @@ class Watch:
         energy = FrameEnergy(self.roi, ROI_MARGIN_PX)
         for frame in self._frames:
             if frame.t_us >= self._begun_us:
-                track.add(int(frame.t_us), self._sign * self._locate(frame.t_us), energy.measure(frame.pixels))
-        vertex = track.vertex() if track.passed else None
-        if vertex is None:
+                track.add_bands(int(frame.t_us), self._sign * self._locate(frame.t_us), energy.measure(frame.pixels))
+        focus = track.focus() if track.passed else None
+        if focus is None:
             return []
-        return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]
+        return [frame_witness(focus, float(np.median(np.diff(track.positions))))]

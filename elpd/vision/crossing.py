@@ -17,16 +17,9 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
-from elpd.vision.integral import (
-    BANDS_PX,
-    MISMATCH,
-    Vertex,
-    band_energy,
-    band_gain,
-    fit_vertex,
-    group_by_pixel,
-    rebuild_levels,
-)
+from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
+from elpd.vision.integral import BANDS_PX, band_image, fit_vertex, group_by_pixel, rebuild_levels
+from elpd.vision.lag import Lag, expected_lag, slope_of_classes
 from elpd.vision.pairs import Mode, find_pairs, weighted_mode
 
 if TYPE_CHECKING:
@@ -37,28 +30,30 @@ if TYPE_CHECKING:
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
-SYSTEMATIC_FRAMES = 0.012
-SYSTEMATIC_VERTEX = 0.08
+SYSTEMATIC_IMAGE = 0.012
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
-VERTEX_IN_MOTION = 0.12
-"""What scene motion adds to the vertex' error, where it strays all pairs."""
+IMAGE_IN_MOTION = 0.1
+"""What scene motion adds to the error of the events' image, where it strays all pairs."""
 
-LAG_UNEXPLAINED = 0.5
+PAIRS_DEPART = 2.0
+"""Pairs sit on the finest detail: what they depart from focus, in departures of the finest band."""
+
+PAIRS_KERNEL = 0.15
+"""Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
+
+LAG_UNEXPLAINED = 0.3
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
-
-ASTRAY = 0.3
-"""Share of stray pairs at which nothing that was measured on pairs is believed any more."""
-
-UNMEASURED_LAG_US = 1_500.0
-"""What a photoreceptor's lag may be when nothing tells: tens of microseconds in sunlight, milliseconds in the dark."""
 
 COARSE_FRAMES = 0.25
 """Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
 
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
+
+WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
+"""Thresholds per unit of log intensity that are tried: sensors have 3 to 20, and losses make it more."""
 
 TICKS = 64
 FEWEST_TICKS = 24
@@ -112,74 +107,69 @@ class EventStretch:
 
 
 @dataclass(frozen=True, slots=True)
-class Lag:
-    """How far the lens went while the brightest photoreceptors answered, and one standard error.
-
-    A pixel ``s`` times slower than the brightest is late by ``s`` times this.
-    ``typical`` is the mean slowness of the pixels that had a say.
-    """
-
-    at: float = 0.0
-    sigma: float = 0.0
-    typical: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
 class EventWitnesses:
-    """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
+    """What the events say: the focus of their image, the mode of their mirror pairs, freed of ``lag``, a typical one."""
 
-    vertex: Vertex | None
+    image: BandFocus | None
     pairs: Mode | None
     lag: Lag
 
-    def witnesses(
-        self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
-    ) -> list[Witness]:
+    def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
 
-        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured, *unexplained* the
-        share of a measured one that may be wrong. *width* is the curve's own, where it is known beforehand; without
-        it, pairs are believed only beside a vertex.
+        *unexplained* is the share of the lag that may be wrong. *width* is the curve's own, where it is known
+        beforehand; without it, pairs are believed only beside an image.
         """
         found: list[Witness] = []
-        if self.vertex is None and width is None:
+        if self.image is None and width is None:
             return found
-        width = width if width is not None or self.vertex is None else self.vertex.width
+        width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
-        shared = unmeasured_lag
-        if self.lag.sigma > 0.0:
-            shared = self.lag.typical * float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
+        shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
         stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
-        # The lag was measured on the pairs: as far as they are astray, it was not.
-        shared = float(np.hypot(shared, min(1.0, stray / ASTRAY) * unmeasured_lag))
-        if self.vertex is not None:
-            sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
-            found.append(Witness("vertex", self.vertex.at, sigma, shared))
+        departure = 0.0
+        if self.image is not None:
+            departure = self.image.departure
+            sigma = float(np.hypot(self.image.sigma, (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * width))
+            found.append(Witness("vertex", self.image.at, sigma, shared))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
-            sigma = float(np.hypot(self.pairs.sigma, (SYSTEMATIC_PAIRS + stray) * width))
-            found.append(Witness("pairs", self.pairs.at, sigma, shared))
+            systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
+            found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
         return found
 
 
 def ask_events(
-    events: EventStretch, begin: float, peak: float, end: float, brightness: NDArray[np.float32] | None = None
+    events: EventStretch,
+    begin: float,
+    peak: float,
+    end: float,
+    brightness: NDArray[np.float32] | None = None,
+    unmeasured_lag: float = 0.0,
+    start: NDArray[np.float32] | None = None,
 ) -> EventWitnesses:
-    """Rebuild the image over positions *begin* .. *end* and find the vertex near *peak*, and the mirror pairs.
+    """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
     *brightness*, (height, width) of the cut-out, relative to the brightest parts, tells how slow each pixel's
-    photoreceptor is; with it, the pairs themselves measure the lag, and both witnesses are freed of it.
+    photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
+    typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
+    *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
     """
     pixels = max(1, events.height * events.width)
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     weight, slowness = _by_brightness(brightness, events)
-    vertex, level_at_peak = _vertex(events, ticks, peak, weight)
-    pairs, lag = _pair_mode(events, level_at_peak, peak, end, slowness)
-    if lag.at > 0.0 and vertex is not None:
-        quick = replace(events, position=events.position - lag.at * slowness[events.y, events.x])
-        corrected, _ = _vertex(quick, ticks, peak, weight)
-        vertex = corrected or vertex
-    return EventWitnesses(vertex, pairs, lag)
+    images = _rebuilt_images(events, ticks)
+    at_peak = images[int(np.argmin(np.abs(ticks - peak)))]
+    curves = _curves(images, start, weight, events.margin)
+    candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
+    image = average_focus(candidates) if candidates else None
+    pairs, lag, typical = _pair_mode(events, at_peak, peak, end, slowness, unmeasured_lag)
+    if image is not None:
+        energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
+        image_lag = float(np.average(slowness, weights=energy)) if energy.any() else 1.0
+        image = replace(image, at=image.at - lag.at * image_lag)
+        typical = image_lag
+    return EventWitnesses(image, pairs, replace(lag, at=lag.at * typical, sigma=lag.sigma * typical))
 
 
 def _by_brightness(
@@ -188,35 +178,53 @@ def _by_brightness(
     """Return each pixel's say in S, and its slowness: how many times slower than the brightest its receptor is."""
     if brightness is None:
         shape = (events.height, events.width)
-        return np.ones(shape, dtype=np.float32), np.zeros(shape)
+        return np.ones(shape, dtype=np.float32), np.ones(shape)
     smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(DARK)
     weight = np.asarray(smooth / np.float32(smooth.mean()), dtype=np.float32)
     return weight, (1.0 + DARK) / (np.maximum(brightness, 0.0).astype(np.float64) + DARK)
 
 
-def _vertex(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
-) -> tuple[Vertex | None, NDArray[np.float32]]:
-    curve, level_at_peak = _rebuilt_curve(events, ticks, peak, weight)
+def _curves(
+    images: NDArray[np.float32], start: NDArray[np.float32] | None, weight: NDArray[np.float32], margin: int
+) -> list[NDArray[np.float64]]:
+    """Return candidates of log S, (ticks, bands): of the images as they are, and with the start picture below them.
+
+    Events count changes since their first; what was there before, the blurred start picture, is missing. In a still
+    scene that is as symmetric in defocus as the picture itself. In one that moves, the picture wanders over what is
+    missing, and S wavers. How many thresholds a unit of log intensity is worth nobody knows, so several are tried.
+    """
+    own = np.array([band_products(image, image, weight, margin) for image in images])
+    curves = [own]
+    if start is not None:
+        below = np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32)
+        mixed = np.array([band_products(image, below, weight, margin) for image in images])
+        under = band_products(below, below, weight, margin)
+        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in WORTHS]
+    return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
+
+
+def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float) -> BandFocus | None:
+    """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record."""
     end = float(ticks[-1])
-    wide = fit_vertex(ticks, curve, end - float(ticks[0]))
-    vertex = None
-    if wide is not None:
-        use = ticks <= end - UNANSWERED * wide.width
-        if int(use.sum()) >= 5:
-            vertex = fit_vertex(ticks[use], curve[use], 0.7 * wide.width)
-    if vertex is not None and vertex.at > end - (UNANSWERED + 0.2) * vertex.width:
-        vertex = None
+    wide = fit_vertex(ticks, curve[:, 0], end - float(ticks[0]))
+    if wide is None:
+        return None
+    use = ticks <= end - UNANSWERED * wide.width
+    if int(use.sum()) < 5:
+        return None
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width)
+    if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
+        return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
-    if vertex is not None and vertex.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
-        vertex = None
-    return vertex, level_at_peak
+    if found.finest.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
+        return None
+    return found
 
 
-def frame_witness(vertex: Vertex, spacing: float) -> Witness:
+def frame_witness(vertex: BandFocus, spacing: float) -> Witness:
     """Return what frames say, taken every *spacing* along the sweep."""
-    coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.width))
-    return Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * coarseness * vertex.width)))
+    coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.finest.width))
+    return Witness("frames", vertex.at, coarseness * vertex.sigma)
 
 
 def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
@@ -243,75 +251,38 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     return FocusEstimate(focus, sigma, "pairs" if main == "pairs" else "crossing", contributions)
 
 
-def _rebuilt_curve(
-    events: EventStretch, ticks: NDArray[np.float64], peak: float, weight: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _rebuilt_images(events: EventStretch, ticks: NDArray[np.float64]) -> NDArray[np.float32]:
     pixels = events.height * events.width
-    pixel = events.y.astype(np.int64) * events.width + events.x
-    starts, order = group_by_pixel(pixel, pixels)
+    starts, order = group_by_pixel(events.y.astype(np.int64) * events.width + events.x, pixels)
     level = np.zeros((ticks.size, pixels), dtype=np.float32)
-    squares = np.zeros((ticks.size, 2))
-    rebuild_levels(starts, order, events.position, events.on, ticks, level, squares)
-    mismatch = MISMATCH**2 * squares.sum(axis=1) / pixels
-    images = level.reshape(ticks.size, events.height, events.width)
-    curve = np.zeros(ticks.size)
-    for band in BANDS_PX:
-        energy = np.array([band_energy(image, band, weight, events.margin) for image in images])
-        energy = np.maximum(energy - band_gain(band) * mismatch, 1e-3 * energy)
-        curve += np.log(energy + 1e-12) / len(BANDS_PX)
-    return curve, images[int(np.argmin(np.abs(ticks - peak)))]
+    rebuild_levels(starts, order, events.position, events.on, ticks, level)
+    return level.reshape(ticks.size, events.height, events.width)
 
 
 def _pair_mode(
-    events: EventStretch, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
-) -> tuple[Mode | None, Lag]:
+    events: EventStretch,
+    level: NDArray[np.float32],
+    peak: float,
+    end: float,
+    slowness: NDArray[np.float64],
+    unmeasured_lag: float,
+) -> tuple[Mode | None, Lag, float]:
+    """Return the mode of the mirror pairs, freed of lag, the lag of the brightest, and the typical slowness."""
     shape = (events.height, events.width)
     pairs = find_pairs(events.t_us, events.x, events.y, events.on, events.position, shape)
-    if pairs.on.size == 0:
-        return None, Lag()
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
-    sign = 2.0 * pairs.on - 1.0
     past = end - peak
-    believed = (sign * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
+    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
     weights = (np.abs(curvature) / gap)[believed]
     middle = pairs.middle[believed]
-    mode = weighted_mode(middle, weights, 0.15 * past)
-    if mode is None or not slowness.any():
-        return mode, Lag()
-    return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past)
-
-
-def without_lag(
-    middle: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    slowness: NDArray[np.float64],
-    mode: Mode,
-    width: float,
-) -> tuple[Mode, Lag]:
-    """Fit ``middle = focus + lag·slowness`` robustly (Tukey's biweight around the mode); the lag is not negative.
-
-    A lag that is not significant is shrunk by its own error, so that a scene without bright and dark pixels keeps its
-    mode and gains nothing but an honest error.
-    """
-    focus, lag = mode.at, 0.0
-    design = np.stack([np.ones_like(slowness), slowness], axis=1)
-    covariance = np.zeros((2, 2))
-    for _ in range(25):
-        residual = middle - focus - lag * slowness
-        biweight = weights * np.square(np.maximum(0.0, 1.0 - np.square(residual / (3.0 * width))))
-        normal = design.T @ (design * biweight[:, None])
-        if biweight.sum() <= 0.0 or np.linalg.cond(normal) > 1e12:
-            return mode, Lag()
-        inverse = np.linalg.inv(normal)
-        focus, lag = (float(one) for one in inverse @ (design.T @ (biweight * middle)))
-        residual = middle - focus - lag * slowness
-        scores = design * (biweight * residual)[:, None]
-        covariance = inverse @ (scores.T @ scores) @ inverse
-    sigma_lag = float(np.sqrt(covariance[1, 1]))
-    typical = float(np.average(slowness, weights=biweight))
-    kept = lag**2 / (lag**2 + sigma_lag**2) if lag > 0.0 else 0.0
-    centre = focus + lag * typical
-    answer = centre - kept * lag * typical
-    sigma = float(np.hypot(np.sqrt(max(covariance[0, 0], 0.0)), (1.0 - kept) * max(lag, 0.0) * typical))
-    return Mode(answer, sigma, mode.count, mode.share), Lag(kept * lag, sigma_lag, typical)
+    mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
+    if mode is None:
+        typical = float(slowness.mean())
+        return None, expected_lag(None, unmeasured_lag / typical), typical
+    slow = slowness[pairs.y, pairs.x][believed]
+    near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
+    typical = float(np.average(slow, weights=near))
+    measured = slope_of_classes(middle, weights, slow, mode.at, PAIRS_KERNEL * past)
+    lag = expected_lag(measured, unmeasured_lag / typical)
+    return replace(mode, at=mode.at - lag.at * typical), lag, typical

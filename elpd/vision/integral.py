@@ -25,11 +25,8 @@ from elpd.events.jit import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-BANDS_PX = (0.8, 1.2)
+BANDS_PX = (0.8, 1.2, 1.8, 2.7)
 """Inner standard deviations of the difference-of-Gaussian bands; the outer is 1.6 times larger."""
-
-MISMATCH = 0.15
-"""Standard deviation of the contrast threshold over pixels, relative; 0.1 to 0.2 in all sensors that publish it."""
 
 _BAND_RATIO = 1.6
 
@@ -40,12 +37,17 @@ def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.
     Of a small image less is left out: at least its middle eight pixels are measured.
     """
     margin = max(0, min(margin, (min(image.shape) - 8) // 2))
-    inner = cv2.GaussianBlur(image, (0, 0), scale_px)
-    inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
     inside = slice(margin, -margin or None)
-    square = np.square(inner[inside, inside])
+    square = np.square(band_image(image, scale_px)[inside, inside])
     square *= weight[inside, inside]
     return float(square.mean(dtype=np.float64))
+
+
+def band_image(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
+    """Return one band of *image*: a difference of Gaussians, the inner of standard deviation *scale_px*."""
+    inner = cv2.GaussianBlur(image, (0, 0), scale_px)
+    inner -= cv2.GaussianBlur(image, (0, 0), scale_px * _BAND_RATIO)
+    return np.asarray(inner, dtype=np.float32)
 
 
 def band_gain(scale_px: float) -> float:
@@ -67,7 +69,7 @@ def add_events(
         level[y[i], x[i]] += 2 * np.int32(on[i]) - 1
 
 
-@kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
+@kernel("void(int64[::1], int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1])")
 def rebuild_levels(
     starts: NDArray[np.int64],
     order: NDArray[np.int64],
@@ -75,7 +77,6 @@ def rebuild_levels(
     on: NDArray[np.uint8],
     ticks: NDArray[np.float64],
     level: NDArray[np.float32],
-    squares: NDArray[np.float64],
 ) -> None:
     """Rebuild each pixel's level at each tick from its events, without the hysteresis of the sensor.
 
@@ -89,8 +90,6 @@ def rebuild_levels(
         Positions at which the levels are wanted, rising.
     level:
         Output, (ticks, pixels): level in thresholds, zero at the beginning.
-    squares:
-        Output, (ticks, 2): sum over pixels of n_on² and of n_off² up to each tick; added to.
     """
     n_ticks = ticks.size
     for k in range(starts.size - 1):
@@ -99,8 +98,6 @@ def rebuild_levels(
         tick = 0
         value = 0.0
         at = -1e300  # where the last knot lies; before the first event the level is constant
-        n_on = 0
-        n_off = 0
         for j in range(begin, end):
             i = order[j]
             here = position[i]
@@ -124,25 +121,15 @@ def rebuild_levels(
                     at = last
                 while tick < n_ticks and ticks[tick] < at:
                     level[tick, k] = value
-                    squares[tick, 0] += n_on * n_on
-                    squares[tick, 1] += n_off * n_off
                     tick += 1
                 width = here - at
                 while tick < n_ticks and ticks[tick] < here:
                     part = (ticks[tick] - at) / width if width > 0.0 else 1.0
                     level[tick, k] = value + step * part
-                    squares[tick, 0] += n_on * n_on
-                    squares[tick, 1] += n_off * n_off
                     tick += 1
             value += step
-            if on[i]:
-                n_on += 1
-            else:
-                n_off += 1
         while tick < n_ticks:
             level[tick, k] = value
-            squares[tick, 0] += n_on * n_on
-            squares[tick, 1] += n_off * n_off
             tick += 1
 
 

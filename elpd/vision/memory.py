@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
+from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.lag import UNMEASURED_LAG_US
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
@@ -144,12 +145,18 @@ class EventMemory:
         return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 
     def ask(
-        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None, deaf_us: float = 0.0
+        self,
+        now_us: int,
+        ruler: Ruler,
+        brightness: NDArray[np.float32] | None = None,
+        deaf_us: float = 0.0,
+        start: NDArray[np.float32] | None = None,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``); events are dated *deaf_us* later, to the
-        release of their pixels. ``None`` when there is nothing to ask.
+        release of their pixels. *start* is the picture, as brightness, that the sensor saw when it began to send what is kept
+        here. ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -166,21 +173,43 @@ class EventMemory:
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX)
-        if brightness is not None:
-            brightness = np.ascontiguousarray(brightness[self._top : self._bottom, self._left : self._right])
+        if begin > 0 or self._forgotten:
+            start = None
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
-        return ask_events(events, flank, peak, now, brightness)
+        return ask_events(
+            events,
+            flank,
+            peak,
+            now,
+            self._cut(brightness),
+            UNMEASURED_LAG_US * ruler.speed_at(peak_us),
+            self._cut(start),
+        )
+
+    def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
+        if picture is None:
+            return None
+        return np.ascontiguousarray(picture[self._top : self._bottom, self._left : self._right])
 
     def witnesses(
-        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None
+        self,
+        now_us: int,
+        ruler: Ruler,
+        brightness: NDArray[np.float32] | None = None,
+        start: NDArray[np.float32] | None = None,
     ) -> tuple[list[Witness], float | None]:
         """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
-        said = self.ask(now_us, ruler, brightness)
-        if said is None or said.vertex is None:
+        deaf = self.refractory()
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start)
+        if said is None or said.image is None:
             return [], None
         _, _, sign = ruler.stretch(now_us)
-        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
-        return [replace(one, at=sign * one.at) for one in said.witnesses(lag)], said.vertex.width
+        undated = deaf.sigma_us * ruler.speed_at(now_us)
+        witnesses = [
+            replace(one, at=sign * one.at, shared=float(np.hypot(one.shared, undated))) for one in said.witnesses()
+        ]
+        return witnesses, said.image.finest.width
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:
