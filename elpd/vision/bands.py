@@ -60,11 +60,19 @@ def band_products(
     one: NDArray[np.float32], other: NDArray[np.float32], weight: NDArray[np.float32], margin: int = 0
 ) -> NDArray[np.float64]:
     """Return the weighted mean product of each band of two images, and last that of the band of noise: (bands + 1,)."""
-    margin = max(0, min(margin, (min(one.shape) - 8) // 2))
-    inside = (slice(margin, -margin or None),) * 2
-    first = _filtered(one, inside)
-    second = first if other is one else _filtered(other, inside)
-    return np.array([float((a * b * weight[inside]).mean(dtype=np.float64)) for a, b in zip(first, second, strict=True)])
+    middle = inside(one.shape, margin)
+    first = _filtered(one, middle)
+    second = first if other is one else _filtered(other, middle)
+    return np.array(
+        [float((a * b * weight[middle]).mean(dtype=np.float64)) for a, b in zip(first, second, strict=True)]
+    )
+
+
+def inside(shape: tuple[int, ...], margin: int) -> tuple[slice, slice]:
+    """Return what is left of an image without its margins: of a small one, at least the middle eight pixels."""
+    margin = max(0, min(margin, (min(shape) - 8) // 2))
+    middle = slice(margin, -margin or None)
+    return middle, middle
 
 
 def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,9 +81,9 @@ def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.maximum(raw - _GAINS * energies[..., -1:], _FLOOR * raw))
 
 
-def _filtered(image: NDArray[np.float32], inside: tuple[slice, slice]) -> list[NDArray[np.float32]]:
-    bands = [band_image(image, scale_px)[inside] for scale_px in BANDS_PX]
-    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, _CORNER), dtype=np.float32)[inside]]
+def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
+    bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
+    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, _CORNER), dtype=np.float32)[middle]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
-from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
-from elpd.vision.integral import BANDS_PX, band_image, fit_vertex, group_by_pixel, rebuild_levels
-from elpd.vision.lag import Lag, expected_lag, slope_of_classes
+from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise, inside
+from elpd.vision.integral import BANDS_PX, band_gain, band_image, fit_vertex, group_by_pixel, rebuild_levels
+from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
 from elpd.vision.pairs import Mode, find_pairs, weighted_mode
 
 if TYPE_CHECKING:
@@ -34,8 +34,25 @@ SYSTEMATIC_IMAGE = 0.012
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
+STILL = 0.1
+"""Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
+one that moves it may say so or not, and both are tried."""
+
+ASTRAY = 0.3
+"""Share of stray pairs at which nothing that was measured on pairs is believed any more."""
+
+DOUBT = 3.0
+"""Error of a lag that was measured on nothing but stray pairs, in lags that one may guess."""
+
 IMAGE_IN_MOTION = 0.1
 """What scene motion adds to the error of the events' image, where it strays all pairs."""
+
+HELD_BACK = 4.0
+"""How much the errors of the image grow with the share of what pixels hold back in it."""
+
+LEAST_LEVEL = 1.0 / 3.0
+"""Variance, in thresholds², of what pixels hold back: evenly between minus one and one threshold since their last
+event. An image that does not stand above it at its sharpest shows the sensor, not the scene."""
 
 PAIRS_DEPART = 2.0
 """Pairs sit on the finest detail: what they depart from focus, in departures of the finest band."""
@@ -43,8 +60,9 @@ PAIRS_DEPART = 2.0
 PAIRS_KERNEL = 0.15
 """Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
 
-LAG_UNEXPLAINED = 0.3
-"""How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
+LAG_UNEXPLAINED = 1.0
+"""How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
+which hides most of the difference."""
 
 COARSE_FRAMES = 0.25
 """Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
@@ -66,8 +84,8 @@ ROI_MARGIN_PX = 14
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
 
-DARK = 0.04
-"""Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (ten of 255 grey levels)."""
+DARK = 0.08
+"""Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (v2e's 20 of 255 levels)."""
 
 _STATIC_SHARE = 0.97
 _MIN_PAIRS = 30
@@ -108,11 +126,15 @@ class EventStretch:
 
 @dataclass(frozen=True, slots=True)
 class EventWitnesses:
-    """What the events say: the focus of their image, the mode of their mirror pairs, freed of ``lag``, a typical one."""
+    """What the events say: the focus of their image, the mode of their mirror pairs, freed of the typical ``lag``.
+
+    ``held_back`` is the variance of what pixels keep to themselves, for less than a threshold, over the image's.
+    """
 
     image: BandFocus | None
     pairs: Mode | None
     lag: Lag
+    held_back: float = 0.0
 
     def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
@@ -126,17 +148,22 @@ class EventWitnesses:
         width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
         shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
-        # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
-        stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
+        stray = _stray(self.pairs)
         departure = 0.0
         if self.image is not None:
             departure = self.image.departure
-            sigma = float(np.hypot(self.image.sigma, (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * width))
+            own = (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * (1.0 + HELD_BACK * self.held_back)
+            sigma = float(np.hypot(self.image.sigma, own * width))
             found.append(Witness("vertex", self.image.at, sigma, shared))
         if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
             systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
             found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
         return found
+
+
+def _stray(pairs: Mode | None) -> float:
+    """Return which share of pairs disagrees beyond what does in a still scene: how much of the rest is not focus."""
+    return max(0.0, _STATIC_SHARE - pairs.share) if pairs is not None else 1.0
 
 
 def ask_events(
@@ -159,17 +186,29 @@ def ask_events(
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     weight, slowness = _by_brightness(brightness, events)
     images = _rebuilt_images(events, ticks)
-    at_peak = images[int(np.argmin(np.abs(ticks - peak)))]
-    curves = _curves(images, start, weight, events.margin)
+    at_peak = images[int(np.argmin(np.abs(ticks - peak)))].copy()
+    slownesses = _slownesses(start, at_peak, slowness)
+    pairs, late = _pair_mode(events, at_peak, peak, end, slownesses, unmeasured_lag)
+    first = _image_focus(_curves(images, None, weight, events.margin)[0], ticks, peak)
+    curves = [] if _stray(pairs) < STILL else _curves(images, start, weight, events.margin)
+    _hush(images, ticks, events, peak if first is None else first.finest.at)
+    curves += _curves(images, start, weight, events.margin)
     candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
     image = average_focus(candidates) if candidates else None
-    pairs, lag, typical = _pair_mode(events, at_peak, peak, end, slowness, unmeasured_lag)
+    energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
+    lags = (
+        [
+            Lag(float(np.average(slow, weights=energy)) * one.at, float(np.average(slow, weights=energy)) * one.sigma)
+            for slow, one in zip(slownesses, late.candidates, strict=True)
+        ]
+        if energy.any()
+        else late.candidates
+    )
+    lag = average_lag(lags, late.weights)
     if image is not None:
-        energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
-        image_lag = float(np.average(slowness, weights=energy)) if energy.any() else 1.0
-        image = replace(image, at=image.at - lag.at * image_lag)
-        typical = image_lag
-    return EventWitnesses(image, pairs, replace(lag, at=lag.at * typical, sigma=lag.sigma * typical))
+        image = replace(image, at=image.at - lag.at)
+    seen = float((energy[inside(energy.shape, events.margin)]).mean())
+    return EventWitnesses(image, pairs, lag, LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12))
 
 
 def _by_brightness(
@@ -182,6 +221,36 @@ def _by_brightness(
     smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(DARK)
     weight = np.asarray(smooth / np.float32(smooth.mean()), dtype=np.float32)
     return weight, (1.0 + DARK) / (np.maximum(brightness, 0.0).astype(np.float64) + DARK)
+
+
+def _hush(images: NDArray[np.float32], ticks: NDArray[np.float64], events: EventStretch, focus: float) -> None:
+    """Take out of the images, in place, what pixels did that have been silent since *focus*.
+
+    They have risen and not yet come back (or have by less than a threshold): they know the way to focus and not the way
+    from it, and would draw the vertex to the late side, the more the lower the scene's contrast.
+    """
+    last = np.full((events.height, events.width), -np.inf)
+    last[events.y, events.x] = events.position
+    silent = last < focus
+    images[:, silent] = images[int(np.argmin(np.abs(ticks - focus)))][silent]
+
+
+def _slownesses(
+    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Return candidates of how slow each pixel is: as in the picture, and as it was in focus, by its events.
+
+    A pixel is as slow as the light that it has when it answers, and the start picture was blurred. What its events are
+    worth in log intensity nobody knows.
+    """
+    if start is None:
+        return [slowness]
+    found = [slowness]
+    for worth in WORTHS:
+        bright = np.maximum(start.astype(np.float64), 0.0) + DARK
+        lit = bright * np.exp(np.clip(level.astype(np.float64) / worth, -5.0, 5.0))
+        found.append((1.0 + DARK) / np.clip(lit, DARK, 1.0 + DARK))
+    return found
 
 
 def _curves(
@@ -259,15 +328,23 @@ def _rebuilt_images(events: EventStretch, ticks: NDArray[np.float64]) -> NDArray
     return level.reshape(ticks.size, events.height, events.width)
 
 
+@dataclass(frozen=True, slots=True)
+class _Lateness:
+    """The lag of the brightest under each candidate for slowness, and how well each explains the pairs."""
+
+    candidates: list[Lag]
+    weights: NDArray[np.float64]
+
+
 def _pair_mode(
     events: EventStretch,
     level: NDArray[np.float32],
     peak: float,
     end: float,
-    slowness: NDArray[np.float64],
+    slownesses: list[NDArray[np.float64]],
     unmeasured_lag: float,
-) -> tuple[Mode | None, Lag, float]:
-    """Return the mode of the mirror pairs, freed of lag, the lag of the brightest, and the typical slowness."""
+) -> tuple[Mode | None, _Lateness]:
+    """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     shape = (events.height, events.width)
     pairs = find_pairs(events.t_us, events.x, events.y, events.on, events.position, shape)
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
@@ -278,11 +355,21 @@ def _pair_mode(
     middle = pairs.middle[believed]
     mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
     if mode is None:
-        typical = float(slowness.mean())
-        return None, expected_lag(None, unmeasured_lag / typical), typical
-    slow = slowness[pairs.y, pairs.x][believed]
+        unknown = [expected_lag(None, unmeasured_lag / float(one.mean())) for one in slownesses]
+        return None, _Lateness(unknown, np.ones(len(unknown)))
     near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
-    typical = float(np.average(slow, weights=near))
-    measured = slope_of_classes(middle, weights, slow, mode.at, PAIRS_KERNEL * past)
-    lag = expected_lag(measured, unmeasured_lag / typical)
-    return replace(mode, at=mode.at - lag.at * typical), lag, typical
+    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
+    typical = [float(np.average(one, weights=near)) for one in slow]
+    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past) for one in slow]
+    # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
+    doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
+    late = [
+        expected_lag(
+            None if line is None else replace(line, sigma=float(np.hypot(line.sigma, doubt / one))),
+            unmeasured_lag / one,
+        )
+        for line, one in zip(lines, typical, strict=True)
+    ]
+    fit = weights_of_lines(lines)
+    lag = average_lag([Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)], fit)
+    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit)

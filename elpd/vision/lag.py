@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 UNMEASURED_LAG_US = 1_000.0
@@ -42,14 +44,24 @@ class Lag:
     sigma: float = 0.0
 
 
-def slope_of_classes(
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A slope and its standard error, the scatter of the points about the line, and how many they are."""
+
+    slope: float
+    sigma: float
+    scatter: float
+    points: int
+
+
+def line_of_classes(
     middle: NDArray[np.float64],
     weights: NDArray[np.float64],
     slowness: NDArray[np.float64],
     mode: float,
     width: float,
-) -> tuple[float, float] | None:
-    """Return the slope of pairs' midpoints against slowness and its standard error; ``None`` if there is no slope.
+) -> Line | None:
+    """Return the line of pairs' midpoints against slowness; ``None`` if there is none.
 
     *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say.
     """
@@ -69,27 +81,52 @@ def slope_of_classes(
     x, y = np.array(slow) - np.mean(slow), np.array(late) - np.mean(late)
     slope = float(x @ y / (x @ x))
     variance = float(np.square(y - slope * x).sum()) / (x.size - 2)
-    return slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24))
+    return Line(slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24)), sqrt(variance), x.size)
 
 
-def expected_lag(measured: tuple[float, float] | None, mean: float) -> Lag:
-    """Return the mean and standard deviation of what is known after a measurement (value, standard error).
+def expected_lag(line: Line | None, mean: float) -> Lag:
+    """Return the mean and standard deviation of what is known after a measurement.
 
     Before it, the lag has the exponential distribution of mean *mean*; a normal error on top leaves a normal
     distribution cut off at zero.
     """
     if mean <= 0.0:
         return Lag()
-    if measured is None or measured[1] > 1e3 * mean:
+    if line is None or line.sigma > 1e3 * mean:
         return Lag(mean, mean)
-    value, sigma = measured
-    shifted = value - sigma * sigma / mean
+    sigma = line.sigma
+    shifted = line.slope - sigma * sigma / mean
     cut = -shifted / sigma
     # Mills' ratio; far out, where the normal's tail underflows, its own expansion.
-    hazard = cut + 1.0 / cut - 2.0 / cut**3 if cut > 20.0 else sqrt(2.0 / pi) * exp(-0.5 * cut * cut) / erfc(cut / sqrt(2.0))
+    hazard = (
+        cut + 1.0 / cut - 2.0 / cut**3 if cut > 20.0 else sqrt(2.0 / pi) * exp(-0.5 * cut * cut) / erfc(cut / sqrt(2.0))
+    )
     at = shifted + sigma * hazard
     variance = sigma * sigma * (1.0 + cut * hazard - hazard * hazard)
     return Lag(max(at, 0.0), sqrt(variance) if variance > 0.0 else max(at, 0.0))
+
+
+def weights_of_lines(lines: Sequence[Line | None]) -> NDArray[np.float64]:
+    """Return how well each of several lines explains the same midpoints, as weights of sum one."""
+    known = [one.scatter for one in lines if one is not None]
+    if not known:
+        return np.full(len(lines), 1.0 / len(lines))
+    least = max(min(known), 1e-12)
+    likelihood = [
+        0.0 if one is None else (least / max(one.scatter, least)) ** (one.points / NEIGHBOURS) for one in lines
+    ]
+    return np.array(likelihood) / sum(likelihood)
+
+
+def average_lag(lags: Sequence[Lag], weights: NDArray[np.float64]) -> Lag:
+    """Average lags by *weights*; the error holds how far the largest of them lies, which may be the right one.
+
+    Answers that are too late by a lag that was underrated all err to one side, and nothing else tells of it.
+    """
+    at, sigma = np.array([one.at for one in lags]), np.array([one.sigma for one in lags])
+    share = weights / weights.sum()
+    mean = float(share @ at)
+    return Lag(mean, float(np.sqrt(share @ sigma**2 + (at.max() - mean) ** 2)))
 
 
 def _robust_mean(values: NDArray[np.float64], weights: NDArray[np.float64], reach: float) -> float:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, EventStretch, ask_events
+from elpd.vision.crossing import FLANK, LEAST_LEVEL, ROI_MARGIN_PX, EventStretch, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.integral import BANDS_PX, band_gain
 from elpd.vision.lag import UNMEASURED_LAG_US
@@ -34,10 +34,6 @@ MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
 FIRST_CAPACITY = 1 << 17
-
-LEAST_LEVEL = 1.0 / 3.0
-"""Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
-event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
 
 LEAST_ORDER = 0.75
 """Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
@@ -112,8 +108,8 @@ class EventMemory:
         return times
 
     def refractory(self) -> Refractory:
-        """Return how long a pixel is deaf after an event, as far as the events tell."""
-        t_us, x, y, _ = (column[: self._count] for column in self._columns)
+        """Return how long a pixel is deaf after an event, as far as the events up to the last ``advance`` tell."""
+        t_us, x, y, _ = (column[: self._taken] for column in self._columns)
         return refractory_period(t_us, x, y, self._shape)
 
     def advance(self, until_us: int, position: float) -> None:
@@ -155,8 +151,8 @@ class EventMemory:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``); events are dated *deaf_us* later, to the
-        release of their pixels. *start* is the picture, as brightness, that the sensor saw when it began to send what is kept
-        here. ``None`` when there is nothing to ask.
+        release of their pixels. *start* is the picture, as brightness, that the sensor saw when it sent the first of
+        them. ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
