@@ -41,6 +41,9 @@ FEWEST_ABOVE = 8
 EVEN_SIGMAS = 2.0
 """So many intervals above the shortest are looked at, and must not crowd towards their end by so many deviations."""
 
+TOGETHER_US = 16.0
+"""Closer together than this all of them are at the period, and whole microseconds say nothing of how they lie."""
+
 UNKNOWN_US = 500.0
 """Standard deviation of a period of which nothing is learnt: sensors are set to some tenths of a millisecond."""
 
@@ -111,7 +114,7 @@ def refractory_period(
     # Evenly spread, they lie at half their range on average; what is set by edges in view crowds towards its end.
     reach = max(float(above.max()), 1.0 / (top_us - least_us))
     lie = float(above.mean()) / reach
-    if lie > 0.5 + EVEN_SIGMAS / np.sqrt(12.0 * above.size):
+    if reach * (top_us - least_us) > TOGETHER_US and lie > 0.5 + EVEN_SIGMAS / np.sqrt(12.0 * above.size):
         return Refractory(0.0, bound_us)
     per_us = float(above.size / (reach * (top_us - least_us)))
     return Refractory(max(0.0, least_us - ORDER / per_us), min(bound_us, float(np.sqrt(ORDER)) / per_us))
