@@ -49,6 +49,9 @@ _FRAMES_AFTER_US = 50_000
 _START_US = 1_000
 """A frame this shortly after the first event still shows what the events began from."""
 
+MAX_SIGMA_DOF = 0.5
+"""The standard error, in depths of focus that the caller told, above which there is no FOCUSED."""
+
 _PATIENT_DROP = 0.2
 """Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
 
@@ -236,7 +239,10 @@ class SweepSearch:
         estimate = fuse(witnesses)
         if estimate is None:
             return None
-        limit = self._depth_of_focus_um or self._width_of(witnesses) / WIDTHS_PER_DEPTH_OF_FOCUS
+        # A depth of focus that was told is kept to as in a cycle; one that is read off the curve is itself rough.
+        limit = self._width_of(witnesses) / WIDTHS_PER_DEPTH_OF_FOCUS
+        if self._depth_of_focus_um is not None:
+            limit = MAX_SIGMA_DOF * self._depth_of_focus_um
         return self._decide(estimate, limit, now_us)
 
     def _image_peak_passed(self) -> bool:
@@ -258,8 +264,8 @@ class SweepSearch:
             self._doubtful = replace(
                 found,
                 outcome=Outcome.LOW_CONFIDENCE,
-                reason=f"the witnesses leave one standard deviation of {found.sigma_us} us, more than a depth of "
-                "focus; sweep more slowly, or give frames or a larger region",
+                reason=f"the witnesses leave one standard deviation of {found.sigma_us} us, more than the depth of "
+                "focus allows; sweep more slowly, or give frames or a larger region",
             )
             return None
         if found.direction is not Direction.APPROACHING and self._on_the_first_way(now_us):
