@@ -12,6 +12,7 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
+from elpd.calibrate.aperture import with_profile
 from elpd.errors import ConfigError, DeviceError
 from elpd.ports import Closeable, RigParts
 from elpd.scale import LensScale
@@ -67,7 +68,9 @@ def build(config: Config) -> RigParts:
         )
     else:
         parts = _hardware(config)
-    return _with_replacements(parts, config) if config.rig == "sim" else parts
+    if config.rig == "sim":
+        parts = _with_replacements(parts, config)
+    return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
 @contextmanager
