@@ -140,13 +140,17 @@ class CalibratedAperture:
 
     @property
     def opening_ms(self) -> float:
-        """From command to fully open, as measured and three standard errors more; the driver's own bound if unknown."""
+        """From command to fully open: the driver's bound, or what was measured and three standard errors if more.
+
+        Never less than the bound: nothing was learnt about closing, which may take longer than opening.
+        """
         parts = [self.profile.delay_us, self.profile.opening_us]
         if any(part.value is None or part.sigma is None for part in parts):
             return self.aperture.opening_ms
         # the error is that of a mean: one opening scatters more
         spread = CERTAIN * np.sqrt(self.profile.openings)
-        return float(sum((part.value or 0.0) + spread * (part.sigma or 0.0) for part in parts)) / 1000.0
+        most_us = float(sum((part.value or 0.0) + spread * (part.sigma or 0.0) for part in parts))
+        return max(self.aperture.opening_ms, most_us / 1000.0)
 
     def transmittance(self, since_open_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the measured transmittance at times after the first light."""
