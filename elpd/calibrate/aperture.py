@@ -89,13 +89,14 @@ def combine(
     if count > 1:
         variance = variance + np.square(every.std(axis=0, ddof=1) / np.maximum(mean, 1e-9)) / count
     begin_sigma_us = float(np.sqrt(np.mean([curve.begin_sigma_us**2 for curve in curves])))
+    opening_sigma_us = float(np.sqrt(np.mean([curve.opening_sigma_us**2 for curve in curves])))
     delay = Quantity.none("nothing says when the aperture was told to open; calibrate on the rig", "us")
     if delays_us:
         delay = _mean(np.array(delays_us), begin_sigma_us)
     return ApertureCalibration(
         **ApertureCalibration.head(on),
         delay_us=delay,
-        opening_us=_mean(opening_us, begin_sigma_us),
+        opening_us=_mean(opening_us, opening_sigma_us),
         since_us=tuple(float(one) for one in grid),
         transmittance=tuple(float(one) for one in mean),
         sigma=tuple(float(one) for one in np.sqrt(variance)),

@@ -60,7 +60,7 @@ LEAST = 1e-6
 LAG_DOUBT = 0.25
 """Relative error of a lag's correction: a photoreceptor is of first order only in the first place."""
 
-SETTLED = 0.998
+NEARLY_SETTLED, SETTLED = 0.99, 0.998
 """The opening is over when so much of all its events has come."""
 
 
@@ -82,14 +82,15 @@ class Pixels:
 class OpeningCurve:
     """A measured opening.
 
-    ``since_us`` counts from ``begin_us`` (sensor time, ``begin_sigma_us`` its standard error), the instant at which
-    light began to come; ``transmittance`` is 0 there and 1 fully open. ``sigma`` is one relative standard error from
-    row to row, ``scale_sigma`` that of the slope of log T, which all rows share. ``exponent`` is that of the power
-    law of the beginning, ``events`` and ``pixels`` what was used.
+    ``since_us`` counts from ``begin_us`` (sensor time), the instant at which light began to come; ``transmittance`` is 0
+    there and 1 fully open. ``begin_sigma_us`` and ``opening_sigma_us`` are standard errors of the beginning and of the
+    whole time. ``sigma`` is one relative standard error from row to row, ``scale_sigma`` that of the slope of log T,
+    which all rows share. ``exponent`` is that of the power law of the beginning, ``events`` and ``pixels`` what was used.
     """
 
     begin_us: float
     begin_sigma_us: float
+    opening_sigma_us: float
     since_us: NDArray[np.float64]
     transmittance: NDArray[np.float64]
     sigma: NDArray[np.float64]
@@ -130,10 +131,14 @@ def measure_opening(events: Columns, geometry: Geometry, begin_us: int, end_us: 
     begins = np.array([one.begin_us for one in others])
     begin_variance = (BLOCKS - 1) / BLOCKS * float(np.square(begins - curve.begin_us).sum())
     begin_variance += (shifted.begin_us - curve.begin_us) ** 2 + BIN_US**2 / 12
+    # lag steepens the power law, which then dates the first light too early: half the exponent is one standard error
+    other_us = _first_light(chains.first_us, times, curve.exponent / 2, curve.begin_us)
+    begin_variance += (other_us - curve.begin_us) ** 2
     since, transmittance, sigma = _table(curve, values, np.sqrt(variance))
     return OpeningCurve(
         begin_us=curve.begin_us,
         begin_sigma_us=float(np.sqrt(begin_variance)),
+        opening_sigma_us=float(np.sqrt(begin_variance + times.end_sigma_us**2)),
         since_us=since,
         transmittance=transmittance,
         sigma=sigma,
@@ -189,6 +194,7 @@ class _Times:
 
     begin_us: float
     knots_us: NDArray[np.float64]
+    end_sigma_us: float
 
 
 def _find_times(t_us: NDArray[np.float64], begin_us: int, end_us: int, pixels: int, *, phase: float) -> _Times:
@@ -221,7 +227,8 @@ def _find_times(t_us: NDArray[np.float64], begin_us: int, end_us: int, pixels: i
             f"{mean[-1]:.1f} ON events per pixel from {edges[start]:.0f} us on (limit {LEAST_KNOTS}): too "
             "little light, or biases that allow only a first event"
         )
-    return _Times(float(edges[start]), knots)
+    nearly = float(np.interp(NEARLY_SETTLED * clear[-1], clear, ends))
+    return _Times(float(edges[start]), knots, 0.5 * (final - nearly))
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,14 +354,19 @@ def _beginning(
     lead = min(4, values.size)
     grown = np.log(times.knots_us[:lead] - before.begin_us)
     exponent = float(np.clip(np.polyfit(grown, np.log(values[:lead]), 1)[0], 0.5, 6.0))
+    return exponent, _first_light(first_us, times, exponent, before.begin_us)
+
+
+def _first_light(first_us: NDArray[np.float64], times: _Times, exponent: float, otherwise_us: float) -> float:
+    """Return when the share of pixels that fired, which grows as light to the power *exponent*, was zero."""
     fired = np.sort(first_us)
     share = np.arange(1, fired.size + 1) / fired.size
     early = (share > 0.02) & (share < 0.3)
     if early.sum() < 10:
-        return exponent, before.begin_us
+        return otherwise_us
     slope, offset = np.polyfit(fired[early] - times.begin_us, share[early] ** (1 / exponent), 1)
-    begin = times.begin_us - offset / slope if slope > 0 else before.begin_us
-    return exponent, float(np.clip(begin, times.begin_us - 4 * BIN_US, float(fired[early][0])))
+    begin = times.begin_us - offset / slope if slope > 0 else otherwise_us
+    return float(np.clip(begin, times.begin_us - 4 * BIN_US, float(fired[early][0])))
 
 
 def _without_lag(curve: _Curve, lag_us: float) -> NDArray[np.float64]:
