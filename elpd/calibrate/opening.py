@@ -82,10 +82,11 @@ class Pixels:
 class OpeningCurve:
     """A measured opening.
 
-    ``since_us`` counts from ``begin_us`` (sensor time), the instant at which light began to come; ``transmittance`` is 0
-    there and 1 fully open. ``begin_sigma_us`` and ``opening_sigma_us`` are standard errors of the beginning and of the
-    whole time. ``sigma`` is one relative standard error from row to row, ``scale_sigma`` that of the slope of log T,
-    which all rows share. ``exponent`` is that of the power law of the beginning, ``events`` and ``pixels`` what was used.
+    ``since_us`` counts from ``begin_us`` (sensor time), the instant at which light began to come; ``transmittance``
+    is 0 there and 1 fully open. ``begin_sigma_us`` and ``opening_sigma_us`` are standard errors of the beginning and of
+    the whole time. ``sigma`` is one relative standard error from row to row, ``scale_sigma`` that of the slope of
+    log T, which all rows share. ``exponent`` is that of the power law of the beginning, ``events`` and ``pixels`` what
+    was used.
     """
 
     begin_us: float
