@@ -11,7 +11,7 @@ from elpd_drivers.lenses import avr_wire
 from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
-from elpd_drivers.sim.lens import SimulatedLens
+from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from virtual import MonotonicClock, TestClock
 
 from elpd.units import HostNs
@@ -54,6 +54,8 @@ class Dialect:
     ``hardest_stop_ms`` is the time from the strongest stop at full speed to rest; ``moves`` tells the command that
     starts a motion, ``lie`` makes the position at the start another one, in a reply that is right otherwise,
     ``question`` is something that an earlier session may have asked, and ``spoil`` flips a bit that a checksum guards.
+    ``homed`` opens one that an earlier session has homed; ``end_switches`` says whether the controller itself stops at
+    the ends of the travel.
     """
 
     hardest_stop_ms: float
@@ -64,6 +66,8 @@ class Dialect:
     spoil: Callable[[bytes], bytes] | None
     settings: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    homed: dict[str, Any] = field(default_factory=dict)
+    end_switches: bool = True
 
 
 def _flip(data: bytes) -> bytes:
@@ -89,7 +93,7 @@ DIALECTS = {
         lie=lambda data: data.replace(b"MPos:-1.500", b"MPos:-0.200"),
         question=b"?",
         spoil=None,
-        settings={"trust_position": True},
+        homed={"trust_position": True},
     ),
     "avr": Dialect(
         2.0,
@@ -127,6 +131,18 @@ DIALECTS["zaber"] = Dialect(
 )
 
 
+DIALECTS["scf4"] = Dialect(
+    3.0,
+    abrupt_keeps_reference=True,
+    moves=lambda data: data.startswith(b"G0"),
+    lie=lambda data: data.replace(b"35200,", b"32900,"),
+    question=b"!1\n",
+    spoil=None,
+    homed={"trust_position": True, "relative": "G91", "speed_scale": 7_680_000.0},
+    end_switches=False,
+)
+
+
 @dataclass
 class Rig:
     kind: str
@@ -138,9 +154,7 @@ class Rig:
     reports: list[Any] = field(default_factory=list)
 
     def open(self, **settings: Any) -> Any:
-        if self.kind == "grbl":
-            settings = {"trust_position": True, **settings}
-        self.lens = CONTROLLERS[self.kind].open_lens(settings, self.clock, self.port)
+        self.lens = CONTROLLERS[self.kind].open_lens({**self.dialect.homed, **settings}, self.clock, self.port)
         self.reports.clear()
         return self.lens
 
@@ -190,11 +204,19 @@ def _skip_what_cannot_be_built(kind: str) -> None:
         pytest.skip(hindrance)
 
 
-def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool = True, **config: Any) -> Rig:
+def rig(
+    kind: str,
+    *,
+    seed: int = 1,
+    start_um: float = 1000.0,
+    um_per_step: float = UM_PER_STEP,
+    referenced: bool = True,
+    **config: Any,
+) -> Rig:
     """Make a rig in virtual time; ``open`` connects the driver."""
     _skip_what_cannot_be_built(kind)
     clock = TestClock()
-    motor = SimulatedLens(start_um=start_um)
+    motor = SimulatedLens(LensMechanics(um_per_step=um_per_step), start_um=start_um)
     kinds = CONTROLLERS[kind].board
     board = kinds.make(motor, kinds.config(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
     port = MemoryPort(board, clock)

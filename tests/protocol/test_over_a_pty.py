@@ -16,7 +16,7 @@ import ticlib
 from elpd_drivers.lenses.serial_port import SerialPort
 from elpd_drivers.sim.boards.line import PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
-from lens_rigs import KINDS, SPEED_SPS, served
+from lens_rigs import DIALECTS, KINDS, SPEED_SPS, served
 from virtual import MonotonicClock
 
 from elpd.errors import BusyError, ConfigError, LensError
@@ -33,7 +33,7 @@ PATIENT = {"reply_ms": 2000.0}
 
 
 def open_lens(kind: str, port: str, **settings: Any) -> Any:
-    more = {"trust_position": True, "connect_ms": 20_000.0} if kind == "grbl" else {}
+    more = {**DIALECTS[kind].homed, **({"connect_ms": 20_000.0} if kind == "grbl" else {})}
     return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more, **settings}, CLOCK, None)
 
 
@@ -241,7 +241,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["marlin"], "known are avr, grbl, tic, tmcl, zaber"),
+        (["marlin"], "known are avr, grbl, scf4, tic, tmcl, zaber"),
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),

@@ -138,6 +138,7 @@ def test_the_same_calls_give_the_same_bits() -> None:
         ("grbl", 1.0, 0.4, 0.6),
         ("tmcl", 0.4, 0.3, 0.1),
         ("zaber", 0.4, 0.3, 0.1),
+        ("scf4", 0.4, 0.4, 0.1),
         ("avr", 0.7, 0.6, 0.1),
     ],
 )
