@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from elpd_drivers.sim.controllers import CONTROLLERS
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from virtual import MonotonicClock, TestClock
 
-from elpd.units import HostNs
+from elpd.units import HostNs, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,19 +56,22 @@ class Dialect:
     starts a motion, ``lie`` makes the position at the start another one, in a reply that is right otherwise,
     ``question`` is something that an earlier session may have asked, and ``spoil`` flips a bit that a checksum guards.
     ``homed`` opens one that an earlier session has homed; ``end_switches`` says whether the controller itself stops at
-    the ends of the travel.
+    the ends of the travel, ``stops`` whether it can be stopped, and ``remembers`` whether it knows where it is by
+    itself. Where there is no ``lie``, no positions are reported.
     """
 
     hardest_stop_ms: float
     abrupt_keeps_reference: bool
     moves: Callable[[bytes], bool]
-    lie: Callable[[bytes], bytes]
+    lie: Callable[[bytes], bytes] | None
     question: bytes
     spoil: Callable[[bytes], bytes] | None
     settings: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
     homed: dict[str, Any] = field(default_factory=dict)
     end_switches: bool = True
+    stops: bool = True
+    remembers: bool = True
 
 
 def _flip(data: bytes) -> bytes:
@@ -141,6 +145,34 @@ DIALECTS["scf4"] = Dialect(
     homed={"trust_position": True, "relative": "G91", "speed_scale": 7_680_000.0},
     end_switches=False,
 )
+
+
+DIALECTS["theia"] = Dialect(
+    0.0,
+    abrupt_keeps_reference=True,
+    moves=lambda data: data[:1] in {b"\x62", b"\x66"},
+    lie=None,
+    question=b"\x76\x0d",
+    spoil=None,
+    homed={"max_speed_um_s": 4000.0, "late_ms": 200.0},
+    stops=False,
+    remembers=False,
+)
+
+
+def needs(ability: str, because: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Skip a test for the kinds whose dialect has not the *ability*, for the reason given."""
+
+    def only_where_able(test: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(test)
+        def run(kind: str, *args: Any, **kwargs: Any) -> None:
+            if not getattr(DIALECTS[kind], ability):
+                pytest.skip(because)
+            test(kind, *args, **kwargs)
+
+        return run
+
+    return only_where_able
 
 
 @dataclass
@@ -225,9 +257,15 @@ def rig(
 
 
 def open_rig(kind: str, **kwargs: Any) -> Rig:
-    """Make a rig and connect its driver."""
+    """Make a rig and connect its driver; what remembers no position is homed and brought back."""
     made = rig(kind, **kwargs)
     made.open()
+    if not made.dialect.remembers and kwargs.get("referenced", True):
+        begin = Steps(round(made.rotor))
+        made.lens.home(made.soon(10_000))
+        made.lens.move_to(begin, SPEED_SPS)
+        made.live(1000)
+        made.reports.clear()
     return made
 
 

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import avr, avr_wire, grbl, scf4, scf4_wire, tic, tmcl, zaber
+from elpd_drivers.lenses import avr, avr_wire, grbl, scf4, scf4_wire, theia, tic, tmcl, zaber
 from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
 from elpd_drivers.sim.boards.scf4 import BOARD as SCF4
 from elpd_drivers.sim.boards.scf4 import Scf4Config
+from elpd_drivers.sim.boards.theia import BOARD as THEIA
 from elpd_drivers.sim.boards.tic import BOARD as TIC
 from elpd_drivers.sim.boards.tmcl import BOARD as TMCL
 from elpd_drivers.sim.boards.zaber import BOARD as ZABER
@@ -79,6 +80,13 @@ def _set_up(wanted: Wanted) -> Table:
     return {"speed_um_s": wanted.speed_um_s, "acceleration_um_s2": wanted.acceleration_um_s2}
 
 
+def _without_ramps(wanted: Wanted) -> Table:
+    """Return the table of a driver whose controller starts and stops at full speed."""
+    table = _told_by_driver(wanted)
+    del table["acceleration_um_s2"]
+    return table
+
+
 _SCF4_AS_MADE = Scf4Config()
 
 
@@ -103,6 +111,7 @@ CONTROLLERS: Mapping[str, Controller] = {
     "avr": Controller(AVR, avr.open_lens, _nothing, _told_within(avr_wire.FASTEST_SPS)),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
     "scf4": Controller(SCF4, scf4.open_lens, _nothing, _homed_scf4),
+    "theia": Controller(THEIA, theia.open_lens, _nothing, _without_ramps),
     "zaber": Controller(ZABER, zaber.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step}),
 }
 
