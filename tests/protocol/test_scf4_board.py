@@ -9,6 +9,7 @@ from elpd_drivers.lenses import scf4_wire as wire
 from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import SPEED_SPS, Rig, open_rig, rig
+from structlog.testing import capture_logs
 
 from elpd.errors import ConfigError, LensError
 from elpd.records import LensFlag, StopMode
@@ -116,13 +117,27 @@ def test_whatever_the_firmware_means_homing_finds_out(relative: str, stops_at_ed
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
 
 
+def test_what_homing_found_out_is_told_and_lets_the_next_session_do_without() -> None:
+    with capture_logs() as told:
+        made = homed(speed_scale=5_100_000.0, settings={"max_speed_um_s": 2000.0})
+    found = {key: told[0][key] for key in UNKNOWN}
+    assert found["speed_scale"] == pytest.approx(5_100_000.0, rel=0.003)
+    made.lens.close()
+    made.plug_in()
+    made.open(max_speed_um_s=2000.0, **found)
+    made.lens.move_to(Steps(2000), SPEED_SPS / 2)
+    made.live(600)
+    assert made.rotor == pytest.approx(2000, abs=2.1)
+
+
 @pytest.mark.parametrize("start_um", [0.0, 3.0, 1000.0, 2500.0])
 def test_it_is_homed_from_everywhere(start_um: float) -> None:
     made = rig("scf4", start_um=start_um)
     made.open(**UNKNOWN)
     report = made.lens.home(made.soon(20_000))
     assert LensFlag.REFERENCED in report.flags
-    assert report.steps == pytest.approx(made.rotor, abs=2.1)
+    assert report.steps == 0.0, "inside the limits, where a later session believes it"
+    assert made.rotor == pytest.approx(0.0, abs=2.1)
 
 
 def test_an_edge_in_the_middle_of_the_travel_is_zero() -> None:

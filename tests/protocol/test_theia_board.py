@@ -18,6 +18,7 @@ from elpd.units import Steps
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 FAST = {"max_speed_um_s": 4000.0}
 
@@ -130,6 +131,16 @@ def test_it_is_homed_from_everywhere(start_um: float) -> None:
     assert made.rotor == pytest.approx(0.0, abs=1e-6)
 
 
+def test_it_can_be_homed_again_from_wherever_it_is() -> None:
+    made = open_rig("theia")
+    report = made.lens.home(made.soon(20_000))
+    assert report.steps == 0.0
+    made.lens.move_to(Steps(500), SPEED_SPS)
+    made.live(200)
+    assert made.reports[-1].steps == 500
+    assert made.rotor == pytest.approx(500)
+
+
 def test_a_switch_at_the_upper_end_is_zero_and_the_travel_lies_below() -> None:
     made = rig("theia", switch_high=True)
     made.open(**FAST, switch="high", min_um=-2500.0, max_um=0.0)
@@ -205,6 +216,83 @@ def test_a_switch_that_is_not_there_is_said_after_a_bounded_search() -> None:
     with pytest.raises(LensError, match=r"did not find the switch; check lens\.switch"):
         made.lens.home(made.soon(60_000))
     assert not made.moving
+
+
+def test_where_it_was_left_is_remembered_by_the_next_session(tmp_path: Path) -> None:
+    settings = {**FAST, "position_file": str(tmp_path / "focus.json")}
+    made = rig("theia")
+    made.open(**settings)
+    made.lens.home(made.soon(20_000))
+    made.lens.move_to(Steps(2500), SPEED_SPS)
+    made.live(300)
+    made.lens.close()
+    made.plug_in()
+    made.open(**settings)
+    made.live(50)
+    assert made.reports[-1].steps == 2500
+    assert LensFlag.REFERENCED in made.reports[-1].flags
+    made.lens.move_to(Steps(100), SPEED_SPS)
+    made.live(300)
+    assert made.rotor == pytest.approx(100)
+
+
+@pytest.mark.parametrize("ending", ["crash", "another lens", "another size", "garbage", "list"])
+def test_what_may_be_wrong_is_not_remembered(tmp_path: Path, ending: str) -> None:
+    file = tmp_path / "focus.json"
+    settings: dict[str, Any] = {**FAST, "position_file": str(file)}
+    made = rig("theia")
+    made.open(**settings)
+    made.lens.home(made.soon(20_000))
+    if ending == "crash":
+        made.lens.move_to(Steps(2500), SPEED_SPS)
+        made.live(20)
+        assert not file.exists(), "gone before the motor moves"
+        made.clock.pass_ms(500)
+    elif ending == "another lens":
+        settings["motor"] = 2
+    elif ending == "another size":
+        settings["um_per_step"] = 0.5
+    else:
+        file.write_text("{" if ending == "garbage" else "[1]")
+    made.lens.close()
+    made.plug_in()
+    made.open(**settings)
+    with pytest.raises(LensError, match="home it first"):
+        made.lens.move_to(Steps(100), 1000.0)
+
+
+def test_a_move_that_ended_at_the_switch_is_not_remembered(tmp_path: Path) -> None:
+    file = tmp_path / "focus.json"
+    made = rig("theia")
+    made.open(**FAST, position_file=str(file))
+    made.lens.home(made.soon(20_000))
+    made.lens.move_to(Steps(3000), SPEED_SPS)
+    made.live(400)
+    assert file.exists()
+    made.motor.slip(made.clock.now_ns(), 1000.0)
+    made.lens.move_to(Steps(0), SPEED_SPS)
+    made.live(400)
+    assert LensFlag.LIMIT in made.reports[-1].flags
+    assert LensFlag.REFERENCED not in made.reports[-1].flags
+    assert not file.exists()
+
+
+def test_a_position_that_could_not_be_forgotten_keeps_the_motor_where_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "focus.json"
+    made = rig("theia")
+    made.open(**FAST, position_file=str(file))
+    made.lens.home(made.soon(20_000))
+    file.unlink()
+    file.mkdir()
+    with pytest.raises(LensError, match="cannot remove"):
+        made.lens.move_to(Steps(3000), SPEED_SPS)
+    made.clock.pass_ms(100)
+    assert made.rotor == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_place_where_nothing_can_be_remembered_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"lens\.position_file: cannot write into"):
+        rig("theia").open(position_file=str(tmp_path / "nowhere" / "focus.json"))
 
 
 def test_older_firmware_is_refused_with_what_was_seen() -> None:

@@ -16,6 +16,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import structlog
+
 from elpd.errors import ConfigError, LensError
 from elpd.motion.trajectory import Motion, Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from elpd_drivers.lenses.scf4_homing import Found
 
 T = TypeVar("T")
+_log = structlog.get_logger()
 
 IDENTIFICATIONS = 3
 KNOWN_FIRMWARE = "EVB.1."
@@ -344,6 +347,13 @@ class Scf4Controller:
         except StopIteration as ended:
             found: Found = ended.value
             self._relative, self._speed_scale, self._errand = found.relative, found.speed_scale, None
+            if not self._settings.trust_position:
+                _log.warning(
+                    "homing found out; with these in [lens] the lens needs to be homed once after power-up only",
+                    trust_position=True,
+                    relative=found.relative,
+                    speed_scale=round(found.speed_scale),
+                )
 
 
 def _limits(settings: Scf4Settings) -> LensLimits:

@@ -88,7 +88,7 @@ class Homing:
         self._reach = min(round(1.2 * (limits.max_steps - limits.min_steps)) + 200, LONGEST_MOVE)
 
     def run(self) -> Generator[None, Seen, Found]:
-        """Find everything out; end at rest beside the edge, with the counter set. Raises ``Trouble``."""
+        """Find everything out; end at rest on the edge, with the counter set. Raises ``Trouble``."""
         self._say("M0 A")
         yield from self._rest()
         for text in ("M238", "M230 A", f"M240 A{PROBE_CODE}"):
@@ -182,9 +182,9 @@ class Homing:
         """Go away and come back at half the speed; return what a speed times its code is."""
         up, down = self._limits.max_steps, -self._limits.min_steps
         way = 1 if up >= down else -1
-        length = min(max(up, down), TIMED_STEPS)
-        there, there_sigma = yield from self._timed(way * length, PROBE_CODE)
-        back, back_sigma = yield from self._timed(-way * length, 2 * PROBE_CODE)
+        target = HOMED_COUNT + way * min(max(up, down), TIMED_STEPS)
+        there, there_sigma = yield from self._timed(target, PROBE_CODE)
+        back, back_sigma = yield from self._timed(HOMED_COUNT, 2 * PROBE_CODE)
         self._refuse_unlike(
             there, back, 5 * (there_sigma + back_sigma), "at half the speed", "the codes are no periods"
         )
@@ -198,11 +198,11 @@ class Homing:
         self._refuse_unlike(self._speed_scale, there, 5 * there_sigma, "measured", "correct lens.speed_scale")
         return self._speed_scale
 
-    def _timed(self, steps: int, code: int) -> Generator[None, Seen, tuple[float, float]]:
-        """Go *steps* at a code; return speed times code, and its relative standard error."""
+    def _timed(self, target: int, code: int) -> Generator[None, Seen, tuple[float, float]]:
+        """Go to a count at a code; return speed times code, and its relative standard error."""
         self._say(f"M240 A{code}")
         seen = yield from self._rest()
-        begin = seen.count
+        begin, steps = seen.count, target - seen.count
         self._say(f"G0 A{steps}")
         readings: list[Seen] = []
         quiet = 0

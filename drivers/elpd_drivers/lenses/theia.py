@@ -7,7 +7,7 @@ that a focus cycle which must stop on the moment refuses it before anything move
 
 At the switch the board ends a motion by itself and does not tell; but the answer comes too early then, which is how it
 shows here: the position was not what it seemed, and the lens must be homed. A move whose answer was lost is never sent
-again: relative moves done twice go twice as far.
+again: relative moves done twice go twice as far. With a ``position_file`` the count outlives the session.
 
 Positions count from the switch, upwards with the command 0x66.
 """
@@ -28,6 +28,7 @@ from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, run_target
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.motor import Motor
+from elpd_drivers.lenses.remembered import Remembered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -57,7 +58,8 @@ class TheiaSettings:
 
     ``motor`` is 1 (focus) or 2 (zoom). ``switch`` says at which end of the travel it is: "low" where 0x66 leads away
     from it. ``connect_ms`` is how long to wait for a board that does not answer because it moves, ``late_ms`` how much
-    longer than it should take a motion may go without an answer. ``latency_us`` is the usual time from a command's
+    longer than it should take a motion may go without an answer. ``position_file`` is where to keep the position from
+    one session to the next; without it each begins with homing. ``latency_us`` is the usual time from a command's
     last bit to its effect, USB included, and ``latency_sigma_us`` how well that is known; unless given, a real port
     gets what USB adapters need.
     """
@@ -74,6 +76,7 @@ class TheiaSettings:
     reply_ms: float = 100.0
     connect_ms: float = 5000.0
     late_ms: float = 500.0
+    position_file: str = ""
     latency_us: float = 300.0
     latency_sigma_us: float = 120.0
 
@@ -99,6 +102,8 @@ class TheiaLens:
         self._replies = wire.ReplyReader()
         self._read_ns = self._asked_ns = 0
         self._going: _Going | None = None
+        ruler = {"motor": settings.motor, "switch": settings.switch, "um_per_step": settings.um_per_step}
+        self._remembered = Remembered(settings.position_file, ruler)
         self._steps = 0
         self._at_switch = False
 
@@ -118,7 +123,7 @@ class TheiaLens:
         )
 
     def connect(self) -> None:
-        """Identify the board, tell it of its motor, and take where it is for 0 until it was homed."""
+        """Identify the board, tell it of its motor; where that is is remembered, or unknown (and called 0)."""
         with self._guarded():
             self._identify()
             self._line.send(wire.set_up(self._settings.motor, self._setup()))
@@ -127,6 +132,9 @@ class TheiaLens:
                 self._wait(due, "no answer to the motor's set-up (0x63); check the cable")
             if reply[1] != 0:
                 raise Trouble("the board refuses the motor's set-up (0x63); compare [lens] with its manual")
+            steps = self._remembered.recall()
+            if steps is not None and self.limits.min_steps <= steps <= self.limits.max_steps:
+                self._steps, self._motor.referenced = steps, True
             self._report(self._clock.now_ns(), self._clock.now_ns())
 
     def home(self, deadline: HostNs) -> LensReport:
@@ -144,9 +152,11 @@ class TheiaLens:
             self._motor.referenced = True
             self._motor.at_rest()
             now = self._clock.now_ns()
-            self._motor.begin(self._report(now, now))
-            assert self._motor.report is not None, "just made"
-            return self._flagged(self._motor.report)
+            self._remembered.keep(self._steps)
+            report = LensReport(0.0, now, now, 0.0)
+            self._motor.begin(report)
+            self._motor.report = report
+            return self._flagged(report)
 
     def move_to(self, target: Steps, speed_sps: float) -> CommandStamp:
         """Start an absolute move. Raises ``UsageError`` while another one is under way: it cannot be called off."""
@@ -259,6 +269,7 @@ class TheiaLens:
             return CommandStamp(name, sent.written_from_ns, sent.written_to_ns)
 
     def _send(self, message: bytes, takes_s: float, target: int | None) -> _Going:
+        self._remembered.forget()
         sent = self._line.send(message)
         self._at_switch = False
         late_ns = round(self._settings.late_ms * NS_PER_MS)
@@ -312,6 +323,8 @@ class TheiaLens:
             self._motor.begin(report)
             return report
         self._steps = going.target
+        if self._motor.referenced:
+            self._remembered.keep(self._steps)
         return self._report(max(earliest_ns, min(going.ends_ns, latest_ns)), latest_ns)
 
     def _report(self, earliest_ns: int, latest_ns: int) -> LensReport:
