@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import random
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from elpd_drivers.lenses import theia_wire as wire
 from hypothesis import given
@@ -19,6 +21,9 @@ from elpd.units import Steps
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from elpd.records import PositionEstimate
+    from elpd.units import HostNs
 
 FAST = {"max_speed_um_s": 4000.0}
 
@@ -180,6 +185,33 @@ def test_a_stop_does_nothing_and_the_capabilities_say_so() -> None:
     made.live(200)
     assert made.rotor == pytest.approx(6400)
     assert made.reports[-1].steps == 6400
+
+
+def test_where_it_is_on_its_way_is_known_as_well_as_it_says() -> None:
+    covered: list[bool] = []
+    for seed in range(5):
+        choose = random.Random(seed)
+        made = open_rig("theia", seed=seed)
+        asked: list[HostNs] = []
+        given: list[PositionEstimate] = []
+
+        def ask(made: Rig = made, asked: list[HostNs] = asked, given: list[PositionEstimate] = given) -> None:
+            made.poll()
+            asked.append(made.clock.now_ns())
+            given.append(made.lens.position_at(asked[-1]))
+
+        for _ in range(6):
+            made.lens.move_to(Steps(choose.randint(0, 8000)), choose.uniform(4000, SPEED_SPS))
+            made.live(2100, ask)
+        truth = made.truth(asked)
+        assert -1e-6 <= truth.min() <= truth.max() <= 8000 + 1e-6
+        on_its_way = np.abs(made.truth([when + 1000 for when in asked]) - truth) > 1e-4
+        assert on_its_way.sum() > 500
+        for estimates in (given, [made.lens.position_at(when) for when in asked]):
+            gap = np.array([one.steps for one in estimates]) - truth
+            sigma = np.array([one.sigma_steps for one in estimates])
+            covered.extend((np.abs(gap) < 2 * sigma)[on_its_way])
+    assert np.mean(covered) >= 0.95
 
 
 def test_a_reply_that_never_comes_is_a_fault_and_the_move_is_not_sent_again() -> None:
