@@ -68,7 +68,7 @@ def test_an_errand_that_is_cancelled_stops_on_its_way(kind: str) -> None:
     assert arrival.cancelled
     assert not rig.moving
     assert 1010.0 < arrival.um < 1900.0
-    assert arrival.steps == rig.rotor
+    assert arrival.steps == pytest.approx(rig.rotor, abs=1e-3)
 
 
 def test_an_errand_that_is_cancelled_waits_for_what_cannot_be_stopped() -> None:
