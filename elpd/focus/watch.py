@@ -18,7 +18,8 @@ from elpd.events.stream import PacketDecoder
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
 from elpd.vision.crossing import (
-    LAG_UNEXPLAINED,
+    DARK,
+    DARK_OF_MAP,
     ROI_MARGIN_PX,
     WIDTHS_PER_DEPTH_OF_FOCUS,
     Witness,
@@ -66,9 +67,9 @@ Too far on the way back costs less than not far enough."""
 
 FOR_EVER = SensorUs(1 << 62)
 
-LAG_UNEXPLAINED_BY_MAP = 0.15
-"""Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
-saturation, says which pixels are slow."""
+LAG_UNEXPLAINED_LIVE = 0.3
+"""Share of the lag correction that may be wrong where the picture that says which pixels are slow is a temporal map,
+taken without saturation, or the newest frame: neither is as blurred as the first frame of a record."""
 
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
@@ -357,14 +358,14 @@ class Watch:
         if end_us > memory.track.times_us[-1]:
             memory.advance(end_us, self._sign * self._locate(SensorUs(end_us)))
         deaf = memory.refractory()
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
+        dark = DARK if self._settings.frames else DARK_OF_MAP
+        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us, dark=dark)
         if said is None:
             return None
         speed_um_us = 1e-6 * self._settings.speed_um_s
-        unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unexplained, self._width_um)
+            for one in said.witnesses(LAG_UNEXPLAINED_LIVE, self._width_um)
         ]
         self.flicker = memory.flicker()
         self.depths_um = tuple(self._sign * at for at in said.depths)

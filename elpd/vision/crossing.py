@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
-SYSTEMATIC_IMAGE = 0.012
+SYSTEMATIC_IMAGE = 0.04
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
@@ -98,6 +98,9 @@ ROI_MARGIN_PX = 14
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
 
+DARK_OF_MAP = 0.01
+"""The same for a temporal map: it is made of the photocurrents themselves, the dark current is in it already."""
+
 DARK = 0.08
 """Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (v2e's 20 of 255 levels)."""
 
@@ -155,7 +158,7 @@ class EventWitnesses:
         stray = _stray(self.pairs)
         departure = 0.0
         if self.image is not None:
-            departure = self.image.departure
+            departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
             own = (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * (1.0 + HELD_BACK * self.held_back)
             sigma = float(np.hypot(self.image.sigma, own * width))
             found.append(Witness("vertex", self.image.at, sigma, shared))
@@ -179,6 +182,7 @@ def ask_events(
     unmeasured_lag: float = 0.0,
     start: NDArray[np.float32] | None = None,
     calibrated: LagPrior | None = None,
+    dark: float = DARK,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
@@ -186,9 +190,10 @@ def ask_events(
     photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
     typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
     *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
-    *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*.
+    *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
+    *brightness* does not show, relative to the brightest parts.
     """
-    weight, slowness = _by_brightness(brightness, events)
+    weight, slowness = _by_brightness(brightness, events, dark)
     groups = by_pixel(events)
     at_peak = rebuilt(events, groups, np.array([peak]))[0]
     slownesses = _slownesses(start, at_peak, slowness)
@@ -230,15 +235,15 @@ def ask_events(
 
 
 def _by_brightness(
-    brightness: NDArray[np.float32] | None, events: EventStretch
+    brightness: NDArray[np.float32] | None, events: EventStretch, dark: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return each pixel's say in S, and its slowness: how many times slower than the brightest its receptor is."""
     if brightness is None:
         shape = (events.height, events.width)
         return np.ones(shape, dtype=np.float32), np.ones(shape)
-    smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(DARK)
+    smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(dark)
     weight = np.asarray(smooth / np.float32(smooth.mean()), dtype=np.float32)
-    return weight, (1.0 + DARK) / (np.maximum(brightness, 0.0).astype(np.float64) + DARK)
+    return weight, (1.0 + dark) / (np.maximum(brightness, 0.0).astype(np.float64) + dark)
 
 
 def _slownesses(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import LEAST_LEVEL, ROI_MARGIN_PX, ask_events
+from elpd.vision.crossing import DARK, LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain
@@ -192,12 +192,13 @@ class EventMemory:
         brightness: NDArray[np.float32] | None = None,
         deaf_us: float = 0.0,
         start: NDArray[np.float32] | None = None,
+        dark: float = DARK,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
-        *brightness* is that of the whole sensor (``Reference.brightness``); events are dated *deaf_us* later, to the
-        release of their pixels. *start* is the picture, as brightness, that the sensor saw when it sent the first of
-        them. ``None`` when there is nothing to ask.
+        *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
+        show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
+        that the sensor saw when it sent the first of them. ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -226,6 +227,7 @@ class EventMemory:
             UNMEASURED_LAG_US * ruler.speed_at(peak_us),
             self._cut(start),
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
+            dark,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
