@@ -232,7 +232,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
         port = process.stdout.readline().strip()
         with serial.Serial(port, 115_200, timeout=20) as line:
             line.write(b"$I\n")
-            assert line.read_until(b"ok\r\n").endswith(b"[VER:1.1h.20190825:]\r\n[OPT:V,15,128]\r\nok\r\n")
+            assert line.read_until(b"ok\r\n").endswith(b"[VER:1.1h.20190830:]\r\n[OPT:V,15,128]\r\nok\r\n")
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=30)
         assert process.returncode == 0

@@ -25,6 +25,7 @@ from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, S
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, run_target
+from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
     ALARM_WORDS,
@@ -85,6 +86,7 @@ class GrblLens:
         self._resetting = self._locked_by_stop = False
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
+        self._dialect = DIALECTS[-1]
         self._motor = self._new_motor()
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
@@ -102,8 +104,8 @@ class GrblLens:
             abrupt_stop=False,
             stop_on_command=True,
             homing=True,
-            stop_onset_ms=self._settings.stop_onset_ms,
-            stop_onset_sigma_ms=self._settings.stop_onset_sigma_ms,
+            stop_onset_ms=self._stop_onset_ms,
+            stop_onset_sigma_ms=self._stop_onset_sigma_ms,
             watchdog_ms=None,
         )
 
@@ -112,8 +114,10 @@ class GrblLens:
         with self._guarded():
             board = handshake(self._line, self._clock, self._settings)
             self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
+            self._dialect = board.dialect
             self._motor = self._new_motor()
-            self._motor.referenced = board.idle and self._settings.trust_position and not board.restarted
+            believed = board.homed or (board.idle and self._settings.trust_position)
+            self._motor.referenced = believed and not board.restarted
             due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
             while self._poll(fuse=True) is None:
                 self._wait(due, "no report after connecting; check the cable")
@@ -169,6 +173,16 @@ class GrblLens:
             pass  # the line is dead: the jog ends at its target
         self._line.close()
 
+    @property
+    def _stop_onset_ms(self) -> float:
+        known = self._settings.stop_onset_ms
+        return self._dialect.stop_onset_ms if known is None else known
+
+    @property
+    def _stop_onset_sigma_ms(self) -> float:
+        known = self._settings.stop_onset_sigma_ms
+        return self._dialect.stop_onset_sigma_ms if known is None else known
+
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def _home(self, deadline: HostNs) -> LensReport:
@@ -177,7 +191,7 @@ class GrblLens:
             self._await_idle(deadline)
         self._motor.referenced, self._motor.rest_due_ns, self._wish = False, None, None
         self._unacknowledged.append(None)
-        self._line.send(b"$H\n")
+        self._line.send(self._dialect.home)
         self._asking.forget()
         while self._unacknowledged:
             self._take_lines(fuse=False)
@@ -190,6 +204,12 @@ class GrblLens:
             raise Trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
         self._motor.begin(report)
         self._motor.referenced, self._locked_by_stop = True, False
+        if self._dialect.remembers:
+            self._unacknowledged.append(None)
+            self._line.send(f"T{HOMED_BY_US}\n".encode("ascii"))
+            while self._unacknowledged:
+                self._take_lines(fuse=True)
+                self._wait(deadline, "no answer after homing; check the cable")
         return self._flagged(report)
 
     def _await_idle(self, deadline: HostNs) -> None:
@@ -251,11 +271,11 @@ class GrblLens:
             self._unacknowledged.clear()
             motor.command(REST, sent_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
         elif not self._stopping and self._busy():
-            onset_ns = sent_ns + round(self._settings.stop_onset_ms * NS_PER_MS)
+            onset_ns = sent_ns + round(self._stop_onset_ms * NS_PER_MS)
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
                 braking = Motion(self._limits.acceleration_sps2, segment_s=SEGMENT_S)
-                motor.command(braking, onset_ns, self._settings.stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
+                motor.command(braking, onset_ns, self._stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
         self._stopping = True
 
     def _take_next_step(self) -> None:
