@@ -334,7 +334,10 @@ class Trajectory:
         epoch.steps, epoch.variance = steps, before.learnt(h_offset, h_delay) + motion.rounding_steps**2
         if epoch.anchor is not None:
             steps, velocity = epoch.anchor
-            epoch.steps, epoch.variance = steps, self._reading_variance(velocity, self._timing.reply_sigma_ns / NS_PER_S)
+            epoch.steps, epoch.variance = (
+                steps,
+                self._reading_variance(velocity, self._timing.reply_sigma_ns / NS_PER_S),
+            )
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
         further = steps + _FURTHER_STEPS
         epoch.further = lay_out(start, further, motion.pieces(further, velocity))

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 0.010
 STOPS_TRIED = 3
+RESTART_MS = 1500.0
+"""How long the board may be silent after a reset: in motion, it sleeps for half a second over its alarm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +86,7 @@ class GrblLens:
         self._cruise_sps = 0.0
         self._stopping = False
         self._resetting = self._locked_by_stop = False
+        self._restarted_by_ns = 0
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
         self._dialect = DIALECTS[-1]
@@ -149,6 +152,7 @@ class GrblLens:
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
             self._resetting = self._locked_by_stop = True
+            self._restarted_by_ns = after_ms(self._clock.now_ns(), RESTART_MS)
         sent = self._line.send(data)
         self._note_stop(mode, sent.off_wire_ns)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
@@ -186,6 +190,9 @@ class GrblLens:
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def _home(self, deadline: HostNs) -> LensReport:
+        while self._resetting:
+            self._poll(fuse=False)
+            self._wait(deadline, "the board did not come back from a reset; look at the board")
         if self._motor.report is not None and self._motor.report.moving:
             self.stop(StopMode.RAMPED)
             self._await_idle(deadline)
@@ -224,6 +231,8 @@ class GrblLens:
 
     def _begin(self, wish: _Wish, name: str) -> CommandStamp:
         """Jog now if at rest; else cancel, and let ``poll`` jog when the motor stands."""
+        if self._resetting:
+            raise LensError("lens: GRBL restarts after an abrupt stop; home it first")
         now, stops = self._clock.now_ns(), self._motor.stops
         if not self._busy():
             return self._jog(wish, name, stops)
@@ -290,6 +299,10 @@ class GrblLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = self._take_lines(fuse=fuse)
         now = self._clock.now_ns()
+        if self._resetting:
+            if now >= self._restarted_by_ns:
+                raise Trouble(f"no banner within {RESTART_MS:.0f} ms of a reset; check the cable and the supply")
+            return report
         self._asking.check(now, "")
         if self._asking.due(now):
             self._sampled_from_ns = self._line.send(STATUS).off_wire_ns
@@ -348,6 +361,7 @@ class GrblLens:
             if not self._resetting:
                 raise Trouble("the board restarted by itself (its banner came); check its supply, then home")
             self._resetting = False
+            self._asking.forget()
 
     def _take_status(self, status: Status, begun: int, *, fuse: bool) -> LensReport | None:
         if not self._asking.open:

@@ -32,8 +32,9 @@ class GrblLensSettings:
     The travel ends half the pull-off (``$27``) before a homing switch that is a hard limit too (``$21``, ``$22``).
     ``um_per_step`` must agree with the board's ``$100``. ``stop_onset_ms`` is the time from a stop byte to the first
     slower segment; unless given, what the firmware is known for. ``trust_position`` believes any board that is idle
-    when it is opened, instead of only one that this driver has homed and that was not reset since. ``latency_us`` and ``latency_sigma_us`` are for real-time bytes; unless given, a real port gets what USB
-    adapters need, which is wider. ``connect_ms`` is the patience with a board that boots when its port is opened.
+    when it is opened, instead of only one that this driver has homed and that was not reset since. ``latency_us`` and
+    ``latency_sigma_us`` are for real-time bytes; unless given, a real port gets what USB adapters need, which is
+    wider. ``connect_ms`` is the patience with a board that boots when its port is opened.
     """
 
     port: str = ""
@@ -55,7 +56,10 @@ class GrblLensSettings:
 
 @dataclass(frozen=True, slots=True)
 class BoardFacts:
-    """What the board says about itself. ``homed``: by this driver, and not reset since; ``restarted``: its banner came."""
+    """What the board says about itself.
+
+    ``homed``: by this driver, and not reset since. ``restarted``: its banner came while it was looked at.
+    """
 
     limits: LensLimits
     steps_per_mm: float
@@ -98,7 +102,7 @@ class _Handshake:
         dialect = dialect_of(version)
         if dialect is None:
             raise LensError(
-                f"lens port {self._line.name}: this driver speaks to {', '.join(known.name for known in DIALECTS)}, the "
+                f"lens port {self._line.name}: this driver knows {', '.join(known.name for known in DIALECTS)}; the "
                 f"board says {' '.join(version)[:80]!r}; update its firmware, or choose another lens.driver"
             )
         board = self._numbers(self._ask("$$", "$"))

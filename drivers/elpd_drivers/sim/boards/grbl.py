@@ -7,7 +7,8 @@ What matters to whoever focuses through GRBL is modelled as the firmware does it
   its byte. A reset (0x18) kills the pulses at once; in motion, the position is then unsure and the board locked.
 - *The main loop.* Real-time bytes are taken out of the stream on arrival; lines wait in a receive buffer of 128
   characters for their turn, and ``ok`` says "planned", not "done".
-- *Alarms.* After a hard limit the board says ``ALARM:1`` and then nothing at all until it is reset.
+- *Alarms.* After a hard limit the board says ``ALARM:1`` and then nothing at all until it is reset. After any alarm
+  it sleeps for half a second, deaf even to a reset: the banner after an abrupt stop comes that late.
 
 ``FS`` tells the speed at the end of the last prepared segment, which is why it reads 0 while the motor still brakes.
 Consecutive blocks do not blend: each ends at rest. Overrides are accepted and have no effect.
@@ -36,6 +37,8 @@ SEGMENT_S = 0.010
 SEGMENT_NS = round(SEGMENT_S * NS_PER_S)
 PLANNER_BLOCKS = 15
 RX_BUFFER = 128
+RESET_NS, ALARM_NS = 25 * NS_PER_MS, 500 * NS_PER_MS
+"""A reset first holds the motors for a moment (``$1``); after ``ALARM:`` the firmware sleeps until that is printed."""
 REAL_TIME = frozenset({0x18, 0x21, 0x3F, 0x7E, 0x84, 0x85, *range(0x90, 0xA0)})
 
 
@@ -45,8 +48,8 @@ class GrblConfig:
 
     ``referenced`` begins homed some time ago (Idle, the lower limit switch at minus the travel, no banner); otherwise
     just powered up, locked until ``$H`` or ``$X``.
-    ``firmware`` is whose dialect it speaks: grbl, grblhal, fluidnc or sce2. ``line_us`` is how long the firmware takes over a line, ``real_time_us`` until it acts on a real-time byte;
-    uniform between the two.
+    ``firmware`` is whose dialect it speaks: grbl, grblhal, fluidnc or sce2. ``line_us`` is how long the firmware
+    takes over a line, ``real_time_us`` until it acts on a real-time byte; uniform between the two.
     """
 
     speed_um_s: float = 12_000.0
@@ -135,6 +138,7 @@ class GrblBoard:
         self._relative, self._feed_mm_min, self._mode = False, 0.0, 0
         self._reports = 0
         self._asked_homing = False
+        self._deaf_until_ns = begin_ns
         if self.config.referenced:
             lag = lens.rotor_at(begin_ns) - lens.pulses_at(begin_ns)
             self._offset = round(lag - self._spm * self.settings[130])
@@ -148,7 +152,7 @@ class GrblBoard:
     def receive(self, data: bytes, at_ns: int) -> None:
         """Take bytes whose last one is complete at *at_ns*."""
         self.advance_to(at_ns)
-        for byte in data:
+        for byte in data if at_ns >= self._deaf_until_ns else b"":
             if byte in REAL_TIME:
                 self._receive_real_time(byte, at_ns)
             elif byte in b"\r\n":
@@ -388,7 +392,9 @@ class GrblBoard:
     def _execute(self, pieces: Sequence[Piece], at_ns: int, *, holding: bool = False) -> _Motion:
         """Let the stepper follow a profile from *at_ns* on, segment by segment."""
         profile = lay_out(at_ns, self.lens.pulses_at(at_ns), pieces)
-        self._motion = motion = _Motion(profile, at_ns, max(profile[-1].begin_ns, at_ns), self._firmware.prepared, holding)
+        self._motion = motion = _Motion(
+            profile, at_ns, max(profile[-1].begin_ns, at_ns), self._firmware.prepared, holding
+        )
         self.lens.follow(at_ns, in_segments(pieces, SEGMENT_S))
         self._watch_switches(at_ns)
         return motion
@@ -460,8 +466,9 @@ class GrblBoard:
         self._forget_motion()
         self._state = "Alarm"
         self._print(at_ns, f"ALARM:{code}")
+        self._deaf_until_ns = at_ns + ALARM_NS
         if code in {1, 2}:
-            self._print(at_ns, text.RESET_TO_CONTINUE)
+            self._print(at_ns + ALARM_NS, text.RESET_TO_CONTINUE)
 
     def _reset(self, at_ns: int) -> None:
         """Kill the pulses, forget every line, begin again; in motion the position is lost."""
@@ -475,11 +482,13 @@ class GrblBoard:
         self._forget_modes()
         if moving or homing:
             self.lens.halt(at_ns)
-            self._alarm(6 if homing else 3, at_ns)
+            self._alarm(6 if homing else 3, at_ns + RESET_NS)
+        else:
+            self._deaf_until_ns = at_ns + RESET_NS
         self._forget_motion()
         if self._state != "Alarm":
             self._state = "Idle"
-        self._say_hello(at_ns + NS_PER_MS)
+        self._say_hello(self._deaf_until_ns)
 
     def _forget_modes(self) -> None:
         self._relative, self._feed_mm_min, self._mode, self._tool = False, 0.0, 0, 0

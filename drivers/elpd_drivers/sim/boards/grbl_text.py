@@ -41,9 +41,7 @@ class Firmware:
 
 
 FIRMWARES = {
-    "grbl": Firmware(
-        "\r\nGrbl 1.1h ['$' for help]", ("[VER:1.1h.20190830:]", "[OPT:V,15,128]"), one_axis_homing=False
-    ),
+    "grbl": Firmware("\r\nGrbl 1.1h ['$' for help]", ("[VER:1.1h.20190830:]", "[OPT:V,15,128]"), one_axis_homing=False),
     "grblhal": Firmware(
         "\r\nGrblHAL 1.1f ['$' or '$HELP' for help]",
         ("[VER:1.1f.20240815:]", "[OPT:VNMSL,100,1024,3,0]", "[FIRMWARE:grblHAL]", "[DRIVER:iMXRT1062]"),
