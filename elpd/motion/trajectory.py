@@ -91,8 +91,9 @@ class Timing:
 class _Epoch:
     """One command in force: its three layouts, what was learnt about it, and the reports that taught it.
 
-    ``anchor`` is the state that it goes on from where that is not its predecessor's: steps, steps/s. ``nominal_ns`` is when the command was expected to take effect and ``start_ns`` the value that the layouts are
-    made around; ``delay`` is counted from there.
+    ``anchor`` is the state that it goes on from where that is not its predecessor's: steps, steps/s. ``nominal_ns``
+    is when the command was expected to take effect and ``start_ns`` the value that the layouts are made around;
+    ``delay`` is counted from there.
     """
 
     nominal_ns: int

@@ -308,7 +308,7 @@ def test_a_motion_that_the_board_holds_up_goes_on_from_where_it_is() -> None:
     made = open_rig("grbl")
     made.lens.run(3_200.0, made.soon(3000))
     made.live(60)
-    made.board._offset -= 160  # noqa: SLF001  (50 ms of its way are missing from now on)
+    made.board._offset -= 160  # 50 ms of its way are missing from now on
     made.live(200)
     estimate = made.lens.position_at(made.clock.now_ns()).steps
     assert estimate == pytest.approx(made.rotor - 160, abs=8)

@@ -28,8 +28,8 @@ UNSUPPORTED, NO_FEED = 20, 22
 class Firmware:
     """What one firmware of the family says and does.
 
-    ``prepared`` is how many segments of 10 ms run before a stop bites, ``one_axis_homing`` whether ``$HX`` is known, and
-    ``tells_homing`` whether status is reported while homing (GRBL's own cycle answers nothing until it is over).
+    ``prepared`` is how many segments of 10 ms run before a stop bites, ``one_axis_homing`` whether ``$HX`` is known,
+    and ``tells_homing`` whether status is reported while homing (GRBL's own cycle answers nothing until it is over).
     """
 
     greeting: str
