@@ -148,7 +148,7 @@ _FURTHER_STEPS = 1.0
 _MAX_REPORTS = 256
 _RELAY_S = 2e-4
 _RELAYS = 4
-_LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 50_000_000, NS_PER_S
+_LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 200_000_000, NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +251,7 @@ class Trajectory:
     def resume(self, report: LensReport) -> bool:
         """Let the motion commanded last go on from where *report* has it, if it is only early or late on its way.
 
-        That is a motor that is where the model had it up to a second ago or will have it in 50 ms (what was held up
+        That is a motor that is where the model had it up to a second ago or will have it in 200 ms (what was held up
         may have been the acknowledgement), under this command or, for a stop that bit late, one before. Anything else
         is not believed: returns False, and nothing has changed.
         """
