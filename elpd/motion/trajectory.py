@@ -249,24 +249,25 @@ class Trajectory:
             self._follow_from(index + 1)
 
     def resume(self, report: LensReport) -> bool:
-        """Let the motion commanded last go on from where *report* has it, if it is only early or late on its way.
+        """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
 
         That is a motor that is where the model had it up to a second ago or will have it in 200 ms (what was held up
         may have been the acknowledgement), under this command or, for a stop that bit late, one before. Anything else
         is not believed: returns False, and nothing has changed.
         """
         when, _ = self._sampled(report)
-        last = self._epochs[-1]
-        if when <= last.start_ns or last.number == 0:
+        index = self._index(when)
+        present = self._epochs[index]
+        if when <= present.start_ns or present.number == 0:
             return False
-        for epoch in reversed(self._epochs):
-            if epoch.start_ns < when - _LATE_NS and epoch is not last:
+        for epoch in reversed(self._epochs[: index + 1]):
+            if epoch.start_ns < when - _LATE_NS and epoch is not present:
                 break
             velocity = _velocity_where(epoch, report.steps, when + _AHEAD_NS)
             if velocity is not None:
                 anchor = (report.steps, velocity if report.moving else 0.0)
-                self._epochs.append(_Epoch(when, when, last.motion, 0.0, last.number, anchor))
-                self._follow(len(self._epochs) - 1)
+                self._epochs.insert(index + 1, _Epoch(when, when, present.motion, 0.0, present.number, anchor))
+                self._follow_from(index + 1)
                 return True
         return False
 
