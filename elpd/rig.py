@@ -78,9 +78,10 @@ def build(config: Config) -> RigParts:
 def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
     """Open the lens that *config* describes, without a camera, and give it back at the end.
 
+    A controller on a port lives in real time, whatever simulated camera the configuration sets beside it.
     Raises what ``build`` raises.
     """
-    if config.rig == "sim":
+    if config.rig == "sim" and config.lens.driver == "sim":
         parts = build(config)
         try:
             yield parts.clock, parts.lens, parts.scale

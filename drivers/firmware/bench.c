@@ -174,6 +174,10 @@ void bench_reset(void *handle) {
     bench->queue_got = bench->queue_put;
     bench->full = 0;
     bench->enabled = 0;
+    /* The reset has cleared the input registers, but not what the lines are remembered to carry; a level that does not
+     * change is not passed on. */
+    avr_raise_irq(bench->limit_min, bench->rotor <= bench->lowest);
+    avr_raise_irq(bench->limit_max, bench->rotor >= bench->highest);
     set_limits(bench);
 }
 

@@ -74,7 +74,8 @@ class Timing:
     ``reply_sigma_ns`` its scatter from one reply to the next. ``common_sigma_ns`` is what all commands and reports
     share (an adapter's latency): reports cannot average it away. ``quantum_steps`` is the resolution of a report in
     motion, ``rest_quantum_steps`` at rest (0 for a controller that counts whole steps and rests on one).
-    ``ramp_steps`` is how far firmware's ramps stray from the model's while the speed changes.
+    ``ramp_steps`` is how far firmware's ramps stray from the model's while the speed changes. A reply that took longer
+    than ``prompt_ns`` was held up, nobody knows on which side of its sampling.
     """
 
     reply_ns: int
@@ -83,14 +84,16 @@ class Timing:
     quantum_steps: float
     rest_quantum_steps: float = 0.0
     ramp_steps: float = 0.0
+    prompt_ns: int = 10_000_000
 
 
 @dataclass(slots=True)
 class _Epoch:
     """One command in force: its three layouts, what was learnt about it, and the reports that taught it.
 
-    ``nominal_ns`` is when the command was expected to take effect and ``start_ns`` the value that the layouts are
-    made around; ``delay`` is counted from there.
+    ``anchor`` is the state that it goes on from where that is not its predecessor's: steps, steps/s. ``nominal_ns``
+    is when the command was expected to take effect and ``start_ns`` the value that the layouts are made around;
+    ``delay`` is counted from there.
     """
 
     nominal_ns: int
@@ -98,6 +101,7 @@ class _Epoch:
     motion: Motion
     delay_sigma_s: float
     number: int = 0
+    anchor: tuple[float, float] | None = None
     steps: float = 0.0
     variance: float = 0.0
     path: list[Knot] = field(default_factory=list)
@@ -144,6 +148,7 @@ _FURTHER_STEPS = 1.0
 _MAX_REPORTS = 256
 _RELAY_S = 2e-4
 _RELAYS = 4
+_LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 200_000_000, NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +248,29 @@ class Trajectory:
         elif index + 1 < len(self._epochs):
             self._follow_from(index + 1)
 
+    def resume(self, report: LensReport) -> bool:
+        """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
+
+        That is a motor that is where the model had it up to a second ago or will have it in 200 ms (what was held up
+        may have been the acknowledgement), under this command or, for a stop that bit late, one before. Anything else
+        is not believed: returns False, and nothing has changed.
+        """
+        when, _ = self._sampled(report)
+        index = self._index(when)
+        present = self._epochs[index]
+        if when <= present.start_ns or present.number == 0:
+            return False
+        for epoch in reversed(self._epochs[: index + 1]):
+            if epoch.start_ns < when - _LATE_NS and epoch is not present:
+                break
+            velocity = _velocity_where(epoch, report.steps, when + _AHEAD_NS)
+            if velocity is not None:
+                anchor = (report.steps, velocity if report.moving else 0.0)
+                self._epochs.insert(index + 1, _Epoch(when, when, present.motion, 0.0, present.number, anchor))
+                self._follow_from(index + 1)
+                return True
+        return False
+
     def position_at(self, when: HostNs) -> PositionEstimate:
         """Return position and one standard deviation at *when*, past or (as commanded) future.
 
@@ -287,6 +315,8 @@ class Trajectory:
     def _sampled(self, report: LensReport) -> tuple[int, float]:
         """Return when the report was most likely sampled, and the standard deviation of that in seconds."""
         width = max(0, report.latest_ns - report.earliest_ns)
+        if width > self._timing.prompt_ns:
+            return report.earliest_ns + width // 2, width / math.sqrt(12) / NS_PER_S
         late = min(self._timing.reply_ns, width // 2)
         return report.earliest_ns + late, min(self._timing.reply_sigma_ns, width / math.sqrt(12)) / NS_PER_S
 
@@ -304,6 +334,12 @@ class Trajectory:
         start, motion = epoch.start_ns, epoch.motion
         steps, velocity, h_offset, h_delay = before.depends(start)
         epoch.steps, epoch.variance = steps, before.learnt(h_offset, h_delay) + motion.rounding_steps**2
+        if epoch.anchor is not None:
+            steps, velocity = epoch.anchor
+            epoch.steps, epoch.variance = (
+                steps,
+                self._reading_variance(velocity, self._timing.reply_sigma_ns / NS_PER_S),
+            )
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
         further = steps + _FURTHER_STEPS
         epoch.further = lay_out(start, further, motion.pieces(further, velocity))
@@ -363,6 +399,19 @@ class Trajectory:
     def _forget(self, before: int) -> None:
         while len(self._epochs) > 2 and self._epochs[1].start_ns < before:
             del self._epochs[0]
+
+
+def _velocity_where(epoch: _Epoch, steps: float, until_ns: int) -> float | None:
+    """Return the velocity at which *epoch* passed *steps* in about a second before *until_ns*; None: it did not."""
+    when = until_ns
+    after, velocity = state_at(epoch.path, when)
+    while when > max(epoch.start_ns, until_ns - _AHEAD_NS - _LATE_NS):
+        when -= _LOOK_STEP_NS
+        before, velocity = state_at(epoch.path, max(when, epoch.start_ns))
+        if min(before, after) <= steps <= max(before, after):
+            return velocity
+        after = before
+    return None
 
 
 def _says_nothing_new(epoch: _Epoch, report: LensReport, when: int) -> bool:

@@ -15,6 +15,7 @@ from lens_rigs import Rig, open_rig, rig
 
 from elpd.errors import LensError
 from elpd.records import LensFlag, StopMode
+from elpd.units import Steps
 
 
 def say(made: Rig, data: bytes, ms: float = 20.0) -> str:
@@ -54,7 +55,7 @@ def test_it_boots_locked_with_its_banner() -> None:
         (b"G4" + b" " * 10 + b"\n", "error:20"),
         (b"\n", "ok"),
         (b"$\n", grbl_text.HELP + "\r\nok"),
-        (b"$I\n", "[VER:1.1h.20190825:]\r\n[OPT:V,15,128]\r\nok"),
+        (b"$I\n", "[VER:1.1h.20190830:]\r\n[OPT:V,15,128]\r\nok"),
         (b"$G\n", "[GC:G0 G54 G17 G21 G90 G94 M5 M9 T0 F0 S0]\r\nok"),
     ],
 )
@@ -125,12 +126,14 @@ def test_a_stop_bites_after_what_is_prepared_has_run(stop: bytes) -> None:
 def test_a_reset_bites_at_once_and_loses_the_position(made: Rig) -> None:
     say(made, b"$J=G91X1F240\n", 60)
     assert onset_ms(made, b"\x18") < 0.2
+    assert say(made, b"?$I\n", 300) == "ALARM:3\r\n", "it sleeps over its alarm"
+    made.clock.pass_ms(300)
     printed = made.port.read_available().decode()
-    assert printed == "ALARM:3\r\n\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
+    assert printed == "\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
 
 
 def test_a_reset_at_rest_keeps_the_position(made: Rig) -> None:
-    assert say(made, b"\x18") == "\r\nGrbl 1.1h ['$' for help]\r\n"
+    assert say(made, b"\x18", 40) == "\r\nGrbl 1.1h ['$' for help]\r\n"
     assert say(made, b"?").startswith("<Idle|MPos:-1.500")
 
 
@@ -173,9 +176,12 @@ def test_a_feed_hold_of_a_g1_resumes(made: Rig) -> None:
 def test_after_a_hard_limit_there_is_silence_until_a_reset(made: Rig) -> None:
     say(made, b"$20=0\n")
     printed = say(made, b"$J=G91X-2F240\n", 600)
+    assert printed == "ok\r\nALARM:1\r\n"
+    assert say(made, b"\x18", 400) == "[MSG:Reset to continue]\r\n", "so soon a reset is lost"
+    printed += "[MSG:Reset to continue]\r\n"
     assert printed == "ok\r\nALARM:1\r\n[MSG:Reset to continue]\r\n"
     assert say(made, b"?$X\n$I\n?", 200) == ""
-    assert "Grbl 1.1h" in say(made, b"\x18")
+    assert "Grbl 1.1h" in say(made, b"\x18", 40)
     assert say(made, b"$X\n") == "[MSG:Caution: Unlocked]\r\nok\r\n"
 
 
@@ -184,9 +190,9 @@ def test_homing_ends_beside_the_switch() -> None:
     made.clock.pass_ms(10)
     made.port.read_available()
     say(made, b"$H\n", 10)
-    assert "<Home|" in say(made, b"?", 20)
+    assert say(made, b"?", 20) == "", "GRBL says nothing before homing is over"
     made.clock.pass_ms(3000)
-    assert made.port.read_available() == b"ok\r\n"
+    assert made.port.read_available().endswith(b">\r\nok\r\n")
     assert "<Idle|MPos:-2.450" in say(made, b"?")
     assert made.rotor == pytest.approx(160, abs=2)
 
@@ -197,7 +203,7 @@ def test_our_driver_recovers_from_a_hard_limit_by_reset_and_homing() -> None:
     made.lens.run(-12_800.0, made.soon(3000))
     with pytest.raises(LensError, match="hard limit"):
         made.live(1000)
-    lens = made.open(connect_ms=400.0)
+    lens = made.open()
     with pytest.raises(LensError, match="home it first"):
         lens.move_to(100, 12_800.0)
     assert LensFlag.REFERENCED in lens.home(made.soon(9000)).flags
@@ -231,6 +237,82 @@ def test_an_abrupt_stop_needs_homing_afterwards() -> None:
     with pytest.raises(LensError, match="home it first"):
         made.lens.run(12_800.0, made.soon(1000))
     assert LensFlag.REFERENCED in made.lens.home(made.soon(9000)).flags
+
+
+def test_who_opens_the_board_next_knows_that_it_was_homed_until_a_reset() -> None:
+    made = open_rig("grbl", referenced=False)
+    made.lens.home(made.soon(9000))
+    made.lens.close()
+    made.plug_in()
+    made.open(trust_position=False)
+    made.lens.move_to(Steps(1000), 12_800.0)
+    made.live(500)
+    assert made.rotor == pytest.approx(1000, abs=2.1)
+    made.lens.close()
+    made.board.reset_at(made.clock.now_ns())
+    made.plug_in()
+    made.open(trust_position=False)
+    with pytest.raises(LensError, match="home it first"):
+        made.lens.move_to(Steps(1000), 12_800.0)
+
+
+def test_idle_alone_is_no_reference(made: Rig) -> None:
+    made.open(trust_position=False)
+    with pytest.raises(LensError, match="home it first"):
+        made.lens.move_to(Steps(1000), 12_800.0)
+
+
+@pytest.mark.parametrize(("firmware", "onset"), [("grbl", 45), ("grblhal", 45), ("fluidnc", 45), ("sce2", 90)])
+def test_every_dialect_homes_moves_reverses_and_stops(firmware: str, onset: float) -> None:
+    made = open_rig("grbl", referenced=False, firmware=firmware)
+    assert made.lens.capabilities.stop_onset_ms == onset
+    assert LensFlag.REFERENCED in made.lens.home(made.soon(9000)).flags
+    made.lens.move_to(Steps(4000), 12_800.0)
+    made.live(600)
+    assert made.rotor == pytest.approx(4000, abs=2.1)
+    made.lens.run(12_800.0, made.soon(2000))
+    made.live(80)
+    made.lens.run(-12_800.0, made.soon(2000))
+    made.live(300)
+    assert made.motor.velocity_at(made.clock.now_ns()) == pytest.approx(-12_800)
+    sent = made.clock.now_ns()
+    made.lens.stop(StopMode.RAMPED)
+    made.live(300)
+    assert not made.moving
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=2.1)
+    sped = made.motor.motor_steps(np.array([sent, sent + round((onset - 12) * 1e6)], dtype=np.int64))
+    assert sped[0] - sped[1] == pytest.approx(12.8 * (onset - 12), rel=0.02), "nothing bites before what is prepared"
+
+
+@pytest.mark.parametrize("version", ["[VER:0.9j.20160303:]", "[VER:2.0.Marlin:]"])
+def test_unknown_firmware_is_refused_with_what_it_said(made: Rig, version: str) -> None:
+    made.port.faults.garble = lambda data: data.replace(b"[VER:1.1h.20190830:]", version.encode())
+    with pytest.raises(LensError, match=r"grblHAL, GRBL.*" + version[5:9]):
+        made.open()
+
+
+def test_a_board_with_an_unknown_firmware_is_refused() -> None:
+    with pytest.raises(ValueError, match="known are grbl"):
+        rig("grbl", firmware="marlin")
+
+
+def test_the_travel_ends_before_a_homing_switch_that_is_a_hard_limit(made: Rig) -> None:
+    assert made.open().limits.min_steps == 80
+    made.lens.close()
+    made.plug_in()
+    say(made, b"$21=0\n")
+    assert made.open().limits.min_steps == 0
+
+
+def test_a_motion_that_the_board_holds_up_goes_on_from_where_it_is() -> None:
+    made = open_rig("grbl")
+    made.lens.run(3_200.0, made.soon(3000))
+    made.live(60)
+    made.board._offset -= 160  # 50 ms of its way are missing from now on
+    made.live(200)
+    estimate = made.lens.position_at(made.clock.now_ns()).steps
+    assert estimate == pytest.approx(made.rotor - 160, abs=8)
+    assert made.moving
 
 
 # --- codecs ------------------------------------------------------------------------------------------------------

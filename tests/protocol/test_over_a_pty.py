@@ -196,6 +196,24 @@ def test_what_was_written_arrives_and_what_arrived_is_read() -> None:
     os.close(slave)
 
 
+def errand(*arguments: str) -> dict[str, Any]:
+    program = [sys.executable, "-c", "from elpd.cli import main; main()", *arguments, "--json"]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def test_errands_over_a_pty_live_in_real_time_and_know_what_the_one_before_homed() -> None:
+    server, motor = served("grbl", CLOCK)
+    table = ("--set", "lens.driver=grbl", "--set", f"lens.port={server.port}", "--set", "lens.reply_ms=2000.0")
+    assert errand("move", *table, "2000")["error"]["kind"] == "LensError"
+    assert errand("home", *table)["referenced"]
+    moved = errand("move", *table, "2000")
+    assert moved["position_um"] == pytest.approx(2000, abs=0.2)
+    assert motor.rotor_at(CLOCK.now_ns()) == pytest.approx(6400, abs=2.1)
+    server.close()
+
+
 # --- elpd sim-board ----------------------------------------------------------------------------------------------
 
 
@@ -235,7 +253,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
         port = process.stdout.readline().strip()
         with serial.Serial(port, 115_200, timeout=20) as line:
             line.write(b"$I\n")
-            assert line.read_until(b"ok\r\n").endswith(b"[VER:1.1h.20190825:]\r\n[OPT:V,15,128]\r\nok\r\n")
+            assert line.read_until(b"ok\r\n").endswith(b"[VER:1.1h.20190830:]\r\n[OPT:V,15,128]\r\nok\r\n")
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=30)
         assert process.returncode == 0

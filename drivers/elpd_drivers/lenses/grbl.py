@@ -25,6 +25,7 @@ from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, S
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import check_output, check_speed, check_target, limits_from, run_target
+from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
     ALARM_WORDS,
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 0.010
 STOPS_TRIED = 3
+RESTART_MS = 1500.0
+"""How long the board may be silent after a reset: in motion, it sleeps for half a second over its alarm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +87,10 @@ class GrblLens:
         self._cruise_sps = 0.0
         self._stopping = False
         self._resetting = self._locked_by_stop = False
+        self._restarted_by_ns = 0
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
         self._steps_per_mm = self._travel_mm = 0.0
+        self._dialect = DIALECTS[-1]
         self._motor = self._new_motor()
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
@@ -103,8 +108,8 @@ class GrblLens:
             abrupt_stop=False,
             stop_on_command=True,
             homing=True,
-            stop_onset_ms=self._settings.stop_onset_ms,
-            stop_onset_sigma_ms=self._settings.stop_onset_sigma_ms,
+            stop_onset_ms=self._stop_onset_ms,
+            stop_onset_sigma_ms=self._stop_onset_sigma_ms,
             watchdog_ms=None,
         )
 
@@ -113,8 +118,10 @@ class GrblLens:
         with self._guarded():
             board = handshake(self._line, self._clock, self._settings)
             self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
+            self._dialect = board.dialect
             self._motor = self._new_motor()
-            self._motor.referenced = board.idle and self._settings.trust_position and not board.restarted
+            believed = board.homed or (board.idle and self._settings.trust_position)
+            self._motor.referenced = believed and not board.restarted
             due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
             while self._poll(fuse=True) is None:
                 self._wait(due, "no report after connecting; check the cable")
@@ -146,6 +153,7 @@ class GrblLens:
         data = RESET if mode is StopMode.ABRUPT else CANCEL
         if mode is StopMode.ABRUPT:
             self._resetting = self._locked_by_stop = True
+            self._restarted_by_ns = after_ms(self._clock.now_ns(), RESTART_MS)
         sent = self._line.send(data)
         self._note_stop(mode, sent.off_wire_ns)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
@@ -185,15 +193,28 @@ class GrblLens:
             pass  # the line is dead: the jog ends at its target
         self._line.close()
 
+    @property
+    def _stop_onset_ms(self) -> float:
+        known = self._settings.stop_onset_ms
+        return self._dialect.stop_onset_ms if known is None else known
+
+    @property
+    def _stop_onset_sigma_ms(self) -> float:
+        known = self._settings.stop_onset_sigma_ms
+        return self._dialect.stop_onset_sigma_ms if known is None else known
+
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def _home(self, deadline: HostNs) -> LensReport:
+        while self._resetting:
+            self._poll(fuse=False)
+            self._wait(deadline, "the board did not come back from a reset; look at the board")
         if self._motor.report is not None and self._motor.report.moving:
             self.stop(StopMode.RAMPED)
             self._await_idle(deadline)
         self._motor.referenced, self._motor.rest_due_ns, self._wish = False, None, None
         self._unacknowledged.append(None)
-        self._line.send(b"$H\n")
+        self._line.send(self._dialect.home)
         self._asking.forget()
         while self._unacknowledged:
             self._take_lines(fuse=False)
@@ -206,6 +227,12 @@ class GrblLens:
             raise Trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
         self._motor.begin(report)
         self._motor.referenced, self._locked_by_stop = True, False
+        if self._dialect.remembers:
+            self._unacknowledged.append(None)
+            self._line.send(f"T{HOMED_BY_US}\n".encode("ascii"))
+            while self._unacknowledged:
+                self._take_lines(fuse=True)
+                self._wait(deadline, "no answer after homing; check the cable")
         return self._flagged(report)
 
     def _await_idle(self, deadline: HostNs) -> None:
@@ -220,6 +247,8 @@ class GrblLens:
 
     def _begin(self, wish: _Wish, name: str) -> CommandStamp:
         """Jog now if at rest; else cancel, and let ``poll`` jog when the motor stands."""
+        if self._resetting:
+            raise LensError("lens: GRBL restarts after an abrupt stop; home it first")
         now, stops = self._clock.now_ns(), self._motor.stops
         if not self._busy():
             return self._jog(wish, name, stops)
@@ -267,11 +296,11 @@ class GrblLens:
             self._unacknowledged.clear()
             motor.command(REST, sent_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
         elif not self._stopping and self._busy():
-            onset_ns = sent_ns + round(self._settings.stop_onset_ms * NS_PER_MS)
+            onset_ns = sent_ns + round(self._stop_onset_ms * NS_PER_MS)
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
                 braking = Motion(self._limits.acceleration_sps2, segment_s=SEGMENT_S)
-                motor.command(braking, onset_ns, self._settings.stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
+                motor.command(braking, onset_ns, self._stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
         self._stopping = True
 
     def _take_next_step(self) -> None:
@@ -286,6 +315,10 @@ class GrblLens:
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = self._take_lines(fuse=fuse)
         now = self._clock.now_ns()
+        if self._resetting:
+            if now >= self._restarted_by_ns:
+                raise Trouble(f"no banner within {RESTART_MS:.0f} ms of a reset; check the cable and the supply")
+            return report
         self._asking.check(now, "")
         if self._asking.due(now):
             self._sampled_from_ns = self._line.send(STATUS).off_wire_ns
@@ -344,6 +377,7 @@ class GrblLens:
             if not self._resetting:
                 raise Trouble("the board restarted by itself (its banner came); check its supply, then home")
             self._resetting = False
+            self._asking.forget()
 
     def _take_status(self, status: Status, begun: int, *, fuse: bool) -> LensReport | None:
         if not self._asking.open:

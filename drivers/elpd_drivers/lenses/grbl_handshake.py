@@ -6,12 +6,14 @@ somebody else's jog. Each of these has an end in time here, and nothing is moved
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from elpd.errors import ConfigError, LensError
 from elpd.units import after_ms
 from elpd_drivers.lenses.axis import limits_from
+from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US, Dialect, dialect_of
 from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, Status, parse_status
 from elpd_drivers.lenses.lines import LineReader
 
@@ -20,17 +22,19 @@ if TYPE_CHECKING:
     from elpd.records import LensLimits
     from elpd_drivers.lenses.line import Line
 
-_VERSIONS = ("[VER:1.1",)
+_TOOL = re.compile(r"\bT(\d+)\b")
 
 
 @dataclass(frozen=True, slots=True)
 class GrblLensSettings:
     """The table ``[lens]`` for GRBL. What the board knows (``$100``, ``$110``, ``$120``, ``$130``) is read from it.
 
+    The travel ends half the pull-off (``$27``) before a homing switch that is a hard limit too (``$21``, ``$22``).
     ``um_per_step`` must agree with the board's ``$100``. ``stop_onset_ms`` is the time from a stop byte to the first
-    slower segment. ``trust_position`` believes a board that is idle when it is opened; otherwise it must be homed
-    first. ``latency_us`` and ``latency_sigma_us`` are for real-time bytes; unless given, a real port gets what USB
-    adapters need, which is wider. ``connect_ms`` is the patience with a board that boots when its port is opened.
+    slower segment; unless given, what the firmware is known for. ``trust_position`` believes any board that is idle
+    when it is opened, instead of only one that this driver has homed and that was not reset since. ``latency_us`` and
+    ``latency_sigma_us`` are for real-time bytes; unless given, a real port gets what USB adapters need, which is
+    wider. ``connect_ms`` is the patience with a board that boots when its port is opened.
     """
 
     port: str = ""
@@ -41,10 +45,10 @@ class GrblLensSettings:
     max_speed_um_s: float | None = None
     acceleration_um_s2: float | None = None
     query_ms: float = 6.0
-    reply_ms: float = 60.0
+    reply_ms: float = 90.0
     connect_ms: float = 3000.0
-    stop_onset_ms: float = 45.0
-    stop_onset_sigma_ms: float = 3.0
+    stop_onset_ms: float | None = None
+    stop_onset_sigma_ms: float | None = None
     latency_us: float = 225.0
     latency_sigma_us: float = 110.0
     trust_position: bool = False
@@ -52,13 +56,18 @@ class GrblLensSettings:
 
 @dataclass(frozen=True, slots=True)
 class BoardFacts:
-    """What the board says about itself. ``restarted``: its banner came, so its count means nothing."""
+    """What the board says about itself.
+
+    ``homed``: by this driver, and not reset since. ``restarted``: its banner came while it was looked at.
+    """
 
     limits: LensLimits
     steps_per_mm: float
     travel_mm: float
     idle: bool
+    homed: bool
     restarted: bool
+    dialect: Dialect
 
 
 def handshake(line: Line, clock: Clock, settings: GrblLensSettings) -> BoardFacts:
@@ -89,15 +98,26 @@ class _Handshake:
             self._line.send(CANCEL if now < due else RESET)
             self._clock.sleep_until(after_ms(now, 100))
             status = self._status()
-        version = self._ask("$I", "[VER:")
-        if not any(line.startswith(_VERSIONS) for line in version):
+        version = self._ask("$I", "[")
+        dialect = dialect_of(version)
+        if dialect is None:
             raise LensError(
-                f"lens port {self._line.name}: this driver speaks GRBL 1.1, the board says {' '.join(version)[:80]!r}; "
-                "update its firmware, or choose another lens.board"
+                f"lens port {self._line.name}: this driver knows {', '.join(known.name for known in DIALECTS)}; the "
+                f"board says {' '.join(version)[:80]!r}; update its firmware, or choose another lens.driver"
             )
         board = self._numbers(self._ask("$$", "$"))
         limits = _agreed_limits(board, self._settings)
-        return BoardFacts(limits, board[100], board[130], status.state == "Idle", self._restarted)
+        idle = status.state == "Idle"
+        homed = idle and dialect.remembers and self._tool() == HOMED_BY_US
+        return BoardFacts(limits, board[100], board[130], idle, homed, self._restarted, dialect)
+
+    def _tool(self) -> int | None:
+        """Return the number of the tool that the board thinks it holds."""
+        for line in self._ask("$G", "[GC:"):
+            tool = _TOOL.search(line)
+            if tool is not None:
+                return int(tool[1])
+        return None
 
     def _status(self) -> Status:
         """Wait for a status report; a board that says nothing may be dead after an alarm, or booting."""
@@ -110,7 +130,7 @@ class _Handshake:
             if now >= due:
                 raise LensError(
                     f"lens port {self._line.name}: no GRBL answered within {self._settings.connect_ms:.0f} ms (saw "
-                    f"{seen!r}); check power, cable, baud ({self._settings.baud}) and lens.board"
+                    f"{seen!r}); check power, cable, baud ({self._settings.baud}) and lens.driver"
                 )
             if now >= reset_at:
                 self._line.send(RESET)
@@ -177,10 +197,24 @@ def _agreed_limits(board: dict[int, float], settings: GrblLensSettings) -> LensL
     for name, wanted, number, has in (("max_um", max_um, 130, travel_um), ("max_speed_um_s", speed, 110, speed_um_s)):
         if wanted > has * (1 + 1e-6):
             raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${number} allows {has:g}; change one of them")
+    min_um, max_um = _beside_the_switch(board, settings.min_um, max_um)
     acceleration = board[120] * 1000
     if settings.acceleration_um_s2 is not None and abs(settings.acceleration_um_s2 / acceleration - 1) > 1e-3:
         raise ConfigError(
             f"lens.acceleration_um_s2 is {settings.acceleration_um_s2:g}, the board's $120 makes {acceleration:g}; "
             "leave the key out, or change $120"
         )
-    return limits_from(1000 / per_mm, settings.min_um, max_um, speed, acceleration)
+    return limits_from(1000 / per_mm, min_um, max_um, speed, acceleration)
+
+
+def _beside_the_switch(board: dict[int, float], min_um: float, max_um: float) -> tuple[float, float]:
+    """Keep half the pull-off from the end that was homed on: GRBL counts to the very step that closed its switch.
+
+    Where that switch is a hard limit too, going there is an alarm.
+    """
+    if not (board.get(21) and board.get(22)):
+        return min_um, max_um
+    away_um = board.get(27, 0.0) * 1000 / 2
+    if int(board.get(23, 0.0)) & 1:
+        return max(min_um, away_um), max_um
+    return min_um, min(max_um, board[130] * 1000 - away_um)

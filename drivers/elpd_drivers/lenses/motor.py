@@ -22,6 +22,10 @@ CONFIRMATIONS = 3
 """How often in a row an impossible position must be reported to be a fault instead of a bad reply."""
 
 
+RESUMES = 8
+"""How often one command may be held up: a controller, or what lies between, that stands still for a moment."""
+
+
 class Motor:
     """A trajectory, guarded by a lock, and the books around it.
 
@@ -53,7 +57,7 @@ class Motor:
         self._slack_steps = slack_steps
         self._trajectory = Trajectory(timing, floor_steps=floor_steps)
         self._lock = threading.Lock()
-        self._implausible = 0
+        self._implausible = self._resumed = 0
 
     # --- where it is -----------------------------------------------------------------------------------------------
 
@@ -90,6 +94,7 @@ class Motor:
         """Note a command that takes effect at *effective_ns*; return the number to amend it by."""
         with self._lock:
             self.newest_command = self._trajectory.command(motion, effective_ns, sigma_ns)
+            self._resumed = 0
             self._expect_rest(effective_ns, sigma_ns, grace_ms)
             return self.newest_command
 
@@ -116,7 +121,10 @@ class Motor:
             self._implausible = 0
 
     def believes(self, report: LensReport) -> bool:
-        """Learn from a report and say so, or say that it cannot be true. Raises ``Trouble`` when that is confirmed."""
+        """Learn from a report and say so, or say that it cannot be true. Raises ``Trouble`` when that is confirmed.
+
+        A motion that was held up on its way is confirmed too, but goes on from where it is.
+        """
         with self._lock:
             if not self._trajectory.known:
                 self._trajectory.begin(report)
@@ -126,6 +134,10 @@ class Motor:
             if abs(surprise.steps) <= limit:
                 self._implausible = 0
                 self._trajectory.observe(report)
+                return True
+            if self._implausible + 1 >= CONFIRMATIONS and self._resumed < RESUMES and self._trajectory.resume(report):
+                self._implausible, self._resumed = 0, self._resumed + 1
+                self._expect_rest(report.latest_ns, 0.0, None)
                 return True
         self._implausible += 1
         if self._implausible >= CONFIRMATIONS:

@@ -7,7 +7,8 @@ What matters to whoever focuses through GRBL is modelled as the firmware does it
   its byte. A reset (0x18) kills the pulses at once; in motion, the position is then unsure and the board locked.
 - *The main loop.* Real-time bytes are taken out of the stream on arrival; lines wait in a receive buffer of 128
   characters for their turn, and ``ok`` says "planned", not "done".
-- *Alarms.* After a hard limit the board says ``ALARM:1`` and then nothing at all until it is reset.
+- *Alarms.* After a hard limit the board says ``ALARM:1`` and then nothing at all until it is reset. After any alarm
+  it sleeps for half a second, deaf even to a reset: the banner after an abrupt stop comes that late.
 
 ``FS`` tells the speed at the end of the last prepared segment, which is why it reads 0 while the motor still brakes.
 Consecutive blocks do not blend: each ends at rest. Overrides are accepted and have no effect.
@@ -34,9 +35,10 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 0.010
 SEGMENT_NS = round(SEGMENT_S * NS_PER_S)
-PREPARED_SEGMENTS = 5
 PLANNER_BLOCKS = 15
 RX_BUFFER = 128
+RESET_NS, ALARM_NS = 25 * NS_PER_MS, 500 * NS_PER_MS
+"""A reset first holds the motors for a moment (``$1``); after ``ALARM:`` the firmware sleeps until that is printed."""
 REAL_TIME = frozenset({0x18, 0x21, 0x3F, 0x7E, 0x84, 0x85, *range(0x90, 0xA0)})
 
 
@@ -46,17 +48,23 @@ class GrblConfig:
 
     ``referenced`` begins homed some time ago (Idle, the lower limit switch at minus the travel, no banner); otherwise
     just powered up, locked until ``$H`` or ``$X``.
-    ``line_us`` is how long the firmware takes over a line, ``real_time_us`` until it acts on a real-time byte;
-    uniform between the two.
+    ``firmware`` is whose dialect it speaks: grbl, grblhal, fluidnc or sce2. ``line_us`` is how long the firmware
+    takes over a line, ``real_time_us`` until it acts on a real-time byte; uniform between the two.
     """
 
     speed_um_s: float = 12_000.0
     acceleration_um_s2: float = 200_000.0
     baud: int = 115_200
     referenced: bool = False
+    firmware: str = "grbl"
     line_us: tuple[int, int] = (1000, 3000)
     real_time_us: tuple[int, int] = (50, 400)
     ignore_stop: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise ``ValueError`` for an unknown firmware."""
+        if self.firmware not in text.FIRMWARES:
+            raise ValueError(f"firmware is {self.firmware!r}; known are {', '.join(text.FIRMWARES)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +81,13 @@ class _Motion:
     profile: list[Knot]
     begin_ns: int
     end_ns: int
+    prepared: int
     holding: bool = False
 
     def prepared_until_ns(self, now_ns: int) -> int:
         """Return the end of the last segment that is prepared at *now_ns*."""
         running = (now_ns - self.begin_ns) // SEGMENT_NS
-        return min(self.begin_ns + (running + PREPARED_SEGMENTS) * SEGMENT_NS, self.end_ns)
+        return min(self.begin_ns + (running + self.prepared) * SEGMENT_NS, self.end_ns)
 
 
 class GrblBoard:
@@ -109,6 +118,8 @@ class GrblBoard:
             self.config.speed_um_s * 60 / 1000,
             self.config.acceleration_um_s2 / 1000,
         )
+        self._firmware = text.FIRMWARES[self.config.firmware]
+        self._tool = 0
         self._random = random.Random(seed)  # noqa: S311  (latency, not secrets)
         self._now_ns = begin_ns
         self._output: list[tuple[int, bytes]] = []
@@ -128,6 +139,8 @@ class GrblBoard:
         self._switch_ns: int | None = None
         self._relative, self._feed_mm_min, self._mode = False, 0.0, 0
         self._reports = 0
+        self._asked_homing = False
+        self._deaf_until_ns = begin_ns
         if self.config.referenced:
             lag = lens.rotor_at(begin_ns) - lens.pulses_at(begin_ns)
             self._offset = round(lag - self._spm * self.settings[130])
@@ -141,7 +154,7 @@ class GrblBoard:
     def receive(self, data: bytes, at_ns: int) -> None:
         """Take bytes whose last one is complete at *at_ns*."""
         self.advance_to(at_ns)
-        for byte in data:
+        for byte in data if at_ns >= self._deaf_until_ns else b"":
             if byte in REAL_TIME:
                 self._receive_real_time(byte, at_ns)
             elif byte in b"\r\n":
@@ -186,6 +199,7 @@ class GrblBoard:
         self._forget_motion()
         self._lines.clear()
         self._silent = False
+        self._forget_modes()
         self._offset = -round(self.lens.pulses_at(at_ns + NS_PER_MS))
         self._state = "Alarm" if self.settings[22] else "Idle"
         self._say_hello(at_ns + 500 * NS_PER_MS)
@@ -229,6 +243,9 @@ class GrblBoard:
     def _act(self, at_ns: int) -> None:
         _, byte = self._real_time.popleft()
         if byte == 0x3F:
+            if self._state == "Home" and not self._firmware.tells_homing:
+                self._asked_homing = True
+                return
             self._report(at_ns)
         elif byte in {0x21, 0x84, 0x85} and not self.config.ignore_stop:
             if self._state == "Jog":
@@ -269,6 +286,8 @@ class GrblBoard:
         if line.startswith("$J="):
             self._jog(line[3:], at_ns)
             return
+        if line == "$HX" and self._firmware.one_axis_homing:
+            line = "$H"
         if line in {"$X", "$I", "$$", "$#", "$G", "$N", "$C", "$H", "$"}:
             self._query(line, at_ns)
             return
@@ -283,7 +302,7 @@ class GrblBoard:
         if line == "$":
             self._print(at_ns, text.HELP)
         elif line == "$G":
-            modal = f"G{self._mode} G54 G17 G21 G{91 if self._relative else 90} G94 M5 M9 T0"
+            modal = f"G{self._mode} G54 G17 G21 G{91 if self._relative else 90} G94 M5 M9 T{self._tool}"
             self._print(at_ns, f"[GC:{modal} F{self._feed_mm_min:.0f} S0]")
         elif line == "$X":
             if self._state == "Alarm":
@@ -297,7 +316,7 @@ class GrblBoard:
             self._begin_homing(at_ns)
         else:
             answers: dict[str, Sequence[str]] = {
-                "$I": text.VERSION,
+                "$I": self._firmware.version,
                 "$$": self.settings.lines(),
                 "$#": text.PARAMETERS,
                 "$N": ("$N0=", "$N1="),
@@ -327,6 +346,7 @@ class GrblBoard:
             return
         asked = text.parse_motion(line, jog=False)
         self._relative = self._relative if asked.relative is None else asked.relative
+        self._tool = self._tool if asked.tool is None else asked.tool
         self._mode = self._mode if asked.mode is None else asked.mode
         self._feed_mm_min = self._feed_mm_min if asked.feed_mm_min is None else asked.feed_mm_min
         if asked.x_mm is None:
@@ -378,7 +398,9 @@ class GrblBoard:
     def _execute(self, pieces: Sequence[Piece], at_ns: int, *, holding: bool = False) -> _Motion:
         """Let the stepper follow a profile from *at_ns* on, segment by segment."""
         profile = lay_out(at_ns, self.lens.pulses_at(at_ns), pieces)
-        self._motion = motion = _Motion(profile, at_ns, max(profile[-1].begin_ns, at_ns), holding)
+        self._motion = motion = _Motion(
+            profile, at_ns, max(profile[-1].begin_ns, at_ns), self._firmware.prepared, holding
+        )
         self.lens.follow(at_ns, in_segments(pieces, SEGMENT_S))
         self._watch_switches(at_ns)
         return motion
@@ -450,8 +472,9 @@ class GrblBoard:
         self._forget_motion()
         self._state = "Alarm"
         self._print(at_ns, f"ALARM:{code}")
+        self._deaf_until_ns = at_ns + ALARM_NS
         if code in {1, 2}:
-            self._print(at_ns, text.RESET_TO_CONTINUE)
+            self._print(at_ns + ALARM_NS, text.RESET_TO_CONTINUE)
 
     def _reset(self, at_ns: int) -> None:
         """Kill the pulses, forget every line, begin again; in motion the position is lost."""
@@ -462,14 +485,19 @@ class GrblBoard:
         self._lines.clear()
         self._busy_ns = at_ns
         self._silent = False
-        self._relative, self._feed_mm_min, self._mode = False, 0.0, 0
+        self._forget_modes()
         if moving or homing:
             self.lens.halt(at_ns)
-            self._alarm(6 if homing else 3, at_ns)
+            self._alarm(6 if homing else 3, at_ns + RESET_NS)
+        else:
+            self._deaf_until_ns = at_ns + RESET_NS
         self._forget_motion()
         if self._state != "Alarm":
             self._state = "Idle"
-        self._say_hello(at_ns + NS_PER_MS)
+        self._say_hello(self._deaf_until_ns)
+
+    def _forget_modes(self) -> None:
+        self._relative, self._feed_mm_min, self._mode, self._tool = False, 0.0, 0, 0
 
     def _begin_homing(self, at_ns: int) -> None:
         self._blocks.clear()
@@ -513,12 +541,15 @@ class GrblBoard:
         self._state = "Idle"
         self._homing = []
         self._busy_ns = at_ns
+        if self._asked_homing:
+            self._asked_homing = False
+            self._report(at_ns)  # a flag that was up all the time
         self._print(at_ns, "ok")
 
     # --- printing --------------------------------------------------------------------------------------------------
 
     def _say_hello(self, at_ns: int) -> None:
-        self._print(at_ns, text.BANNER)
+        self._print(at_ns, self._firmware.greeting)
         if self._state == "Alarm":
             self._print(at_ns, text.UNLOCK)
         self._reports = 0
@@ -541,7 +572,13 @@ class GrblBoard:
         self._print(
             at_ns,
             text.status_report(
-                state, (count + self._offset) / self._spm, feed, pins=pins, wco=turn == 0, overrides=turn == 1
+                state,
+                (count + self._offset) / self._spm,
+                feed,
+                pins=pins,
+                wco=turn == 0,
+                overrides=turn == 1,
+                axes=self._firmware.axes,
             ),
         )
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-BANNER = "\r\nGrbl 1.1h ['$' for help]"
 UNLOCK = "[MSG:'$H'|'$X' to unlock]"
 UNLOCKED = "[MSG:Caution: Unlocked]"
 RESET_TO_CONTINUE = "[MSG:Reset to continue]"
 HELP = "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"
-VERSION = ("[VER:1.1h.20190825:]", "[OPT:V,15,128]")
 PARAMETERS = (
     *(f"[G{code}:0.000,0.000,0.000]" for code in (54, 55, 56, 57, 58, 59, 28, 30, 92)),
     "[TLO:0.000]",
@@ -24,6 +22,43 @@ PARAMETERS = (
 BAD_NUMBER, BAD_STATEMENT, NEGATIVE, HOMING_OFF, NOT_IDLE, LOCKED = 2, 3, 4, 5, 8, 9
 EXPECTED_LETTER, SOFT_NEEDS_HOMING, LINE_TOO_LONG, BEYOND_TRAVEL, BAD_JOG = 1, 10, 11, 15, 16
 UNSUPPORTED, NO_FEED = 20, 22
+
+
+@dataclass(frozen=True, slots=True)
+class Firmware:
+    """What one firmware of the family says and does.
+
+    ``prepared`` is how many segments of 10 ms run before a stop bites, ``one_axis_homing`` whether ``$HX`` is known,
+    and ``tells_homing`` whether status is reported while homing (GRBL's own cycle answers nothing until it is over).
+    """
+
+    greeting: str
+    version: tuple[str, ...]
+    axes: int = 3
+    prepared: int = 5
+    one_axis_homing: bool = True
+    tells_homing: bool = False
+
+
+FIRMWARES = {
+    "grbl": Firmware("\r\nGrbl 1.1h ['$' for help]", ("[VER:1.1h.20190830:]", "[OPT:V,15,128]"), one_axis_homing=False),
+    "grblhal": Firmware(
+        "\r\nGrblHAL 1.1f ['$' or '$HELP' for help]",
+        ("[VER:1.1f.20240815:]", "[OPT:VNMSL,100,1024,3,0]", "[FIRMWARE:grblHAL]", "[DRIVER:iMXRT1062]"),
+        tells_homing=True,
+    ),
+    "fluidnc": Firmware(
+        "\r\nGrbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]",
+        ("[VER:3.7 FluidNC v3.7.8:]", "[OPT:MPHS]", "[MSG: Machine: lens]"),
+        tells_homing=True,
+    ),
+    "sce2": Firmware(
+        "\r\nGrbl 1.1f-SCE2 ['$' for help]",
+        ("[VER:1.1f-SCE2.20211130:L086,6ZG-BEG19]", "[OPT:V,15,254]"),
+        axes=4,
+        prepared=10,
+    ),
+}
 
 
 class GrblError(Exception):
@@ -82,6 +117,7 @@ class MotionWords:
     feed_mm_min: float | None
     mode: int | None
     machine: bool
+    tool: int | None = None
 
 
 _WORD = re.compile(r"([A-Z])([+-]?\d*\.?\d*)")
@@ -105,7 +141,7 @@ OUTPUT_WORDS = {
 def parse_motion(line: str, *, jog: bool) -> MotionWords:
     """Read the words of a motion line (spaces and case already removed). Raises ``GrblError``."""
     x_mm = relative = feed = mode = None
-    machine = False
+    machine, tool = False, None
     scale = 1.0
     position = 0
     while position < len(line):
@@ -124,6 +160,8 @@ def parse_motion(line: str, *, jog: bool) -> MotionWords:
             mode = int(value)
         elif letter == "G" and value in {17.0, 54.0, 94.0} and not jog:
             continue
+        elif letter == "T" and not jog and 0 <= value <= 255:
+            tool = int(value)
         elif letter == "X":
             x_mm = value
         elif letter == "F":
@@ -138,18 +176,26 @@ def parse_motion(line: str, *, jog: bool) -> MotionWords:
             raise GrblError(UNSUPPORTED)
     if x_mm is not None:
         x_mm *= scale
-    return MotionWords(x_mm, relative, None if feed is None else feed * scale, mode, machine)
+    return MotionWords(x_mm, relative, None if feed is None else feed * scale, mode, machine, tool)
 
 
 def status_report(
-    state: str, position_mm: float, feed_mm_min: float, *, pins: str = "", wco: bool = False, overrides: bool = False
+    state: str,
+    position_mm: float,
+    feed_mm_min: float,
+    *,
+    pins: str = "",
+    wco: bool = False,
+    overrides: bool = False,
+    axes: int = 3,
 ) -> str:
     """Return a status report with machine position, in GRBL's field order."""
-    fields = [state, f"MPos:{position_mm:.3f},0.000,0.000", f"FS:{feed_mm_min:.0f},0"]
+    others = ",0.000" * (axes - 1)
+    fields = [state, f"MPos:{position_mm:.3f}{others}", f"FS:{feed_mm_min:.0f},0"]
     if pins:
         fields.append(f"Pn:{pins}")
     if wco:
-        fields.append("WCO:0.000,0.000,0.000")
+        fields.append(f"WCO:0.000{others}")
     elif overrides:
         fields.append("Ov:100,100,100")
     return f"<{'|'.join(fields)}>"
