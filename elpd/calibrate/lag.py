@@ -116,7 +116,7 @@ def measure_lag(
     found = []
     for sweep in sorted(sweeps, key=lambda one: one.speed_um_s)[:2]:
         for one in sweep.passes:
-            pairs = _pairs(sweep, one, good, geometry, depth_of_focus_um)
+            pairs = focus_pairs(sweep, one, good, geometry, depth_of_focus_um)
             if pairs is not None:
                 found.append(_crossings(pairs, one, sweep, brightness))
     speeds = {round(abs(float(one.velocity.mean()))) for one in found if one.middle.size}
@@ -131,10 +131,13 @@ def _none(reason: str) -> Lag:
     return Lag(Quantity.none(reason, "us"), Quantity.none(reason, "us"), ())
 
 
-def _pairs(
+def focus_pairs(
     sweep: Sweeps, one: Pass, good: NDArray[np.bool_], geometry: Geometry, depth_of_focus_um: float
 ) -> tuple[Pairs, NDArray[np.float64]] | None:
-    """Return the pairs around focus of one pass, with weights; ``None`` if focus was not passed at a steady speed."""
+    """Return the pairs around focus of one pass, with weights; ``None`` if focus was not passed at a steady speed.
+
+    Positions are the ruler's times the pass's sign, so that they rise. *good* is (height, width).
+    """
     events = sweep.events.between(one.begin_us, one.end_us)
     t_us, x, y, on = events.chosen(good[events.y, events.x])
     if t_us.size < FEWEST_PAIRS:
