@@ -6,13 +6,15 @@ late shifts both readings along their own motion by ``v·lag``; at two speeds, b
 together: ``z = middle ± play/2 ± v·lag``.
 
 One shift along the motion does not grow with speed: where ON and OFF thresholds differ, the two halves of a mirror pair
-are not at equal light. It has opposite signs where brightness peaks and where it dips, so each pass is fitted with a
-term for that, and its place is what peaks and dips agree on.
+are not at equal light, which would pass for play. So the ratio of the thresholds is measured first, on the same
+there-and-backs, and pairs are made level by it (``elpd.calibrate.level_pairs``). What is left has opposite signs where
+brightness peaks and where it dips: each pass is fitted with a term for that.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +22,7 @@ import numpy as np
 from elpd.calibrate.lag import focus_pairs
 from elpd.calibrate.play import Play, Reading
 from elpd.calibrate.quantity import Quantity
+from elpd.calibrate.thresholds import NoiseRates, measure_balance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,18 +34,39 @@ if TYPE_CHECKING:
 FEWEST_PASSES = 2
 """In each direction at each speed: with one, nothing tells how well passes agree."""
 
+STRAIGHT = 0.1
+"""Relative error of what unequal thresholds are corrected by: between two events light does not change evenly."""
+
 CURVED = 0.15
 """Relative error of the way that the lag makes: dark pixels follow a fast change less than in proportion to speed."""
 
 
 def measure_backlash(evidence: Evidence, depth_of_focus_um: float) -> Play:
     """Measure the play on there-and-backs through focus at two speeds."""
+    otherwise = evidence.why_not("sweeps", "focus was not passed often enough in both directions")
+    if not evidence.sweeps:
+        return solve([], otherwise)
     geometry = evidence.geometry
     good = np.ones((geometry.height, geometry.width), np.bool_)
+    ratio = measure_balance(evidence.sweeps, NoiseRates(0.0, 0.0), good, geometry).ratio
+    if ratio.value is None:
+        why = f"without the balance of ON and OFF there is none, and {ratio.reason}"
+        return Play(Quantity.none(why, "um"), Quantity.none(why, "us"), ())
+    found = solve(_readings(evidence, good, depth_of_focus_um, ratio.value), otherwise)
+    naive = solve(_readings(evidence, good, depth_of_focus_um, 1.0), otherwise)
+    play = found.backlash_um
+    if play.value is None or play.sigma is None or naive.backlash_um.value is None:
+        return found
+    doubt_um = STRAIGHT * abs(play.value - naive.backlash_um.value)
+    return replace(found, backlash_um=Quantity.of(play.value, math.hypot(play.sigma, doubt_um), "um"))
+
+
+def _readings(evidence: Evidence, good: NDArray[np.bool_], depth_of_focus_um: float, ratio: float) -> list[Reading]:
+    """Return where each pass saw focus, by pairs that a ratio of thresholds makes level."""
     readings = []
     for sweep in evidence.sweeps:
         for one in sweep.passes:
-            pairs = focus_pairs(sweep, one, good, geometry, depth_of_focus_um)
+            pairs = focus_pairs(sweep, one, good, evidence.geometry, depth_of_focus_um, ratio)
             if pairs is None:
                 continue
             found, weight = pairs
@@ -51,7 +75,7 @@ def measure_backlash(evidence: Evidence, depth_of_focus_um: float) -> Play:
             if place is not None:
                 at, sigma = place
                 readings.append(Reading(speed_um_s=one.sign * sweep.speed_um_s, focus_um=at, sigma_um=sigma))
-    return solve(readings, evidence.why_not("sweeps", "focus was not passed often enough in both directions"))
+    return readings
 
 
 def solve(readings: Sequence[Reading], otherwise: str) -> Play:

@@ -190,7 +190,10 @@ def _way(trial: StopTrial, narrowest_ns: int) -> _Gone | None:
 def _line(
     gone: Sequence[_Gone], common_s: float, set_sps2: float | None
 ) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-    """Fit ``way / v = onset + v/2a``; return onset (ms), its scatter, the deceleration (steps/s2), onset by the set one."""
+    """Fit ``way / v = onset + v/2a``.
+
+    Return the onset (ms), its scatter (ms), the deceleration (steps/s2), and the onset by the deceleration that is set.
+    """
     speed = np.array([one.speed_sps for one in gone])
     late_s = np.array([one.steps for one in gone]) / speed
     error_s = np.array([one.sigma_steps for one in gone]) / speed
