@@ -56,6 +56,8 @@ HOME_NEAR, HOME_FAR = 0.02, 0.06
 """Where homing is timed from, in parts of the travel from the reference."""
 
 HOMINGS = 3
+LOOK_S = 0.006
+"""A driver that waits for the end of homing looks this often, or oftener: no homing is timed better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,6 +297,5 @@ def lost_steps(way: float, near_s: Sequence[float], far_s: Sequence[float], afte
         return Quantity.none("homing from further away did not take longer, so its time tells nothing", "steps")
     speed_sps = way / (far - near)
     spread_s = math.hypot(float(np.std(near_s, ddof=1)), float(np.std(far_s, ddof=1))) / math.sqrt(2.0)
-    poll_s = 0.002 / math.sqrt(12.0)
-    sigma_s = math.hypot(spread_s, poll_s) * math.sqrt(1.0 + 1.0 / len(near_s))
+    sigma_s = math.hypot(spread_s * math.sqrt(1.0 + 1.0 / len(near_s)), LOOK_S / math.sqrt(6.0))
     return Quantity.of(speed_sps * (after_s - near), speed_sps * sigma_s, "steps")

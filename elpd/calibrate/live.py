@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from elpd.calibrate.capture import Capture
 from elpd.calibrate.evidence import Evidence
 from elpd.focus.cycle import FocusCycle
-from elpd.focus.expose import expose
+from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
 from elpd.focus.settings import FocusRequest
 from elpd.focus.stage import REST_LIMIT_MS, Stage
@@ -104,6 +104,9 @@ def take_evidence(
             if sweeps_alone:
                 if why is not None:
                     return Evidence(parts.camera.geometry, missing={"sweeps": why})
+                if here and parts.aperture is not None:
+                    parts.aperture.open()
+                    stage.wait_ms(AFTER_FACTOR * parts.aperture.opening_ms)
                 return capture.sweeps_alone()
             if why is not None:
                 return capture.rest_alone(rest_s, {"sweeps": why, "steps": why})

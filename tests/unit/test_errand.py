@@ -36,6 +36,14 @@ def test_a_move_ends_at_rest_where_it_was_sent(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_place_between_whole_micrometres_is_reached_too(kind: str) -> None:
+    rig = open_rig(kind)
+    arrival = errands(rig).move_to(1096.44, SPEED_UM_S)
+    assert rig.rotor * UM_PER_STEP == pytest.approx(1096.44, abs=UM_PER_STEP)
+    assert arrival.um == pytest.approx(1096.44, abs=1.0)  # GRBL reports micrometres
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_jog_is_relative_and_refused_whole_beyond_a_limit(kind: str) -> None:
     rig = open_rig(kind)
     job = errands(rig)
@@ -67,7 +75,7 @@ def test_an_errand_that_is_cancelled_stops_on_its_way(kind: str) -> None:
     assert arrival.cancelled
     assert not rig.moving
     assert 1010.0 < arrival.um < 1900.0
-    assert arrival.steps == rig.rotor
+    assert arrival.steps == pytest.approx(rig.rotor, abs=1e-3)
 
 
 def test_stop_says_where_and_may_be_asked_twice() -> None:
