@@ -56,8 +56,8 @@ HOME_NEAR, HOME_FAR = 0.02, 0.06
 """Where homing is timed from, in parts of the travel from the reference."""
 
 HOMINGS = 3
-LOOK_S = 0.006
-"""A driver that waits for the end of homing looks this often, or oftener: no homing is timed better."""
+LOOK_S = 0.0125
+"""A driver that waits for the end of homing may miss an answer and ask again after this: no homing is timed better."""
 
 
 @dataclass(frozen=True, slots=True)

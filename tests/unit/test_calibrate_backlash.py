@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import sensor_evidence
 from command_line import Answer, caller
 from elpd_drivers.sim.sensor import BiasLevels
-from elpd_drivers.sim.world import BIRTH_NS
 from hypothesis import given
 from hypothesis import strategies as st
+from played import there_and_back_with_play
 
 from elpd.calibrate.backlash import measure_backlash, solve
 from elpd.calibrate.in_use import as_measured
@@ -92,42 +91,12 @@ def test_pairs_of_unequal_thresholds_are_level(ratio: float) -> None:
     assert found.middle.tolist() == pytest.approx([10.0])
 
 
-class Played(sensor_evidence.Knots):
-    """Glass that follows its motor with play."""
-
-    play_um = 0.0
-
-    def __init__(self, knots: list[tuple[float, float]]) -> None:
-        super().__init__(knots)
-        self.grid_s = np.arange(0.0, float(self.t_s[-1]), 1e-3)
-        glass, half = float(self.um[0]), self.play_um / 2
-        path = []
-        for motor in np.interp(self.grid_s, self.t_s, self.um):
-            glass = min(max(glass, float(motor) - half), float(motor) + half)
-            path.append(glass)
-        self.glass_um = np.array(path)
-
-    def carriage_um(self, times_ns: Any) -> Any:
-        return np.interp((np.asarray(times_ns) - BIRTH_NS) / 1e9, self.grid_s, self.glass_um)
-
-
 @pytest.mark.parametrize(
     ("seed", "scene", "c_on", "c_off", "play_um"),
     [(0, "camera", 0.25, 0.18, 2.0), (3, "astronaut", 0.2, 0.24, 0.0), (6, "chelsea", 0.19, 0.16, 8.0)],
 )
-def test_the_play_lies_within_its_error(
-    monkeypatch: pytest.MonkeyPatch, seed: int, scene: str, c_on: float, c_off: float, play_um: float
-) -> None:
-    told = sensor_evidence.Knots
-    made: list[object] = []
-
-    def knots(points: list[tuple[float, float]]) -> Any:
-        made.append(points)
-        return Played(points) if len(made) == 1 else told(points)  # the world's is the first, then the driver's
-
-    monkeypatch.setattr(Played, "play_um", play_um)
-    monkeypatch.setattr(sensor_evidence, "Knots", knots)
-    _, evidence = sensor_evidence.there_and_back(seed, scene, focus=BiasLevels(c_on, c_off, 300))
+def test_the_play_lies_within_its_error(seed: int, scene: str, c_on: float, c_off: float, play_um: float) -> None:
+    evidence = there_and_back_with_play(play_um, seed, scene, focus=BiasLevels(c_on, c_off, 300))
     found = measure_backlash(evidence, 6.0).backlash_um
     assert found.value is not None, found.reason
     assert found.sigma is not None
