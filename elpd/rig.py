@@ -12,9 +12,11 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
+from elpd.calibrate.aperture import with_profile
 from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.lens import teach
 from elpd.errors import ConfigError, DeviceError
+from elpd.motion.lens_output import aperture_on_lens
 from elpd.ports import Closeable, RigParts
 from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
@@ -73,7 +75,7 @@ def build(config: Config) -> RigParts:
     if config.rig == "sim":
         parts = _with_replacements(parts, config)
     teach(parts.lens, config)
-    return parts
+    return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
 @contextmanager
@@ -117,7 +119,7 @@ def _hardware(config: Config) -> RigParts:
     lens = _open_lens(config.lens, clock)
     try:
         camera = _open("elpd.cameras", config.camera, clock)
-        aperture = None if config.aperture.driver in {"sim", "none"} else _open_aperture(config.aperture, clock)
+        aperture = None if config.aperture.driver in {"sim", "none"} else _open_aperture(config.aperture, clock, lens)
     except BaseException:
         if isinstance(lens, Closeable):
             lens.close()
@@ -133,7 +135,7 @@ def _with_replacements(parts: RigParts, config: Config) -> RigParts:
     if config.aperture.driver == "none":
         parts = replace(parts, aperture=None)
     elif config.aperture.driver != "sim":
-        parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock))
+        parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock, parts.lens))
     return parts
 
 
@@ -157,7 +159,9 @@ def _scale(section: LensSection) -> LensScale:
     return LensScale(section.um_per_step, section.steps_to_um)
 
 
-def _open_aperture(section: DeviceSection, clock: Clock) -> Aperture:
+def _open_aperture(section: DeviceSection, clock: Clock, lens: Lens) -> Aperture:
+    if section.driver == "lens-output":
+        return aperture_on_lens(section.settings(), lens)
     aperture: Aperture = find("elpd.apertures", section.driver)(section.settings(), clock)
     return aperture
 

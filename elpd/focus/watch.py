@@ -18,9 +18,9 @@ from elpd.events.stream import PacketDecoder
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
 from elpd.vision.crossing import (
-    LAG_UNEXPLAINED,
+    DARK,
+    DARK_OF_MAP,
     ROI_MARGIN_PX,
-    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
     Witness,
     frame_witness,
@@ -39,6 +39,8 @@ from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
     from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi, SensorProfile
     from elpd.vision.flicker import Flicker
@@ -65,9 +67,9 @@ Too far on the way back costs less than not far enough."""
 
 FOR_EVER = SensorUs(1 << 62)
 
-LAG_UNEXPLAINED_BY_MAP = 0.15
-"""Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
-saturation, says which pixels are slow."""
+LAG_UNEXPLAINED_LIVE = 0.3
+"""Share of the lag correction that may be wrong where the picture that says which pixels are slow is a temporal map,
+taken without saturation, or the newest frame: neither is as blurred as the first frame of a record."""
 
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
@@ -356,15 +358,14 @@ class Watch:
         if end_us > memory.track.times_us[-1]:
             memory.advance(end_us, self._sign * self._locate(SensorUs(end_us)))
         deaf = memory.refractory()
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
+        dark = DARK if self._settings.frames else DARK_OF_MAP
+        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us, dark=dark)
         if said is None:
             return None
         speed_um_us = 1e-6 * self._settings.speed_um_s
-        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
-        unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unmeasured_lag_um, unexplained, self._width_um)
+            for one in said.witnesses(LAG_UNEXPLAINED_LIVE, self._width_um)
         ]
         self.flicker = memory.flicker()
         self.depths_um = tuple(self._sign * at for at in said.depths)
@@ -481,15 +482,15 @@ class Watch:
 
     def _take_frame(self, frame: Frame) -> None:
         if frame.t_us >= self._begun_us:
-            energy = self._frame_energy.measure(frame.pixels)
-            self._frames.append((frame.t_us, energy))
-            self._frame_track.add(int(frame.t_us), self._sign * self._locate(frame.t_us), energy)
+            bands = self._frame_energy.measure(frame.pixels)
+            self._frames.append((frame.t_us, bands))
+            self._frame_track.add_bands(int(frame.t_us), self._sign * self._locate(frame.t_us), bands)
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
 
     def _forget_frames(self) -> None:
-        self._frames: list[tuple[SensorUs, float]] = []
+        self._frames: list[tuple[SensorUs, NDArray[np.float64]]] = []
         self._frame_energy = FrameEnergy(self.roi, ROI_MARGIN_PX)
         self._frame_track = PeakTrack()
 
@@ -507,9 +508,9 @@ class Watch:
     def _ask_frames(self) -> list[Witness]:
         """Ask the frames of this sweep, where three or more saw focus come and go."""
         track = PeakTrack()
-        for when, energy in self._frames:
-            track.add(int(when), self._sign * self._locate(when), energy)
-        vertex = track.vertex() if track.passed else None
-        if vertex is None:
+        for when, bands in self._frames:
+            track.add_bands(int(when), self._sign * self._locate(when), bands)
+        focus = track.focus() if track.passed else None
+        if focus is None:
             return []
-        return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]
+        return [frame_witness(focus, float(np.median(np.diff(track.positions))))]

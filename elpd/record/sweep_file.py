@@ -46,6 +46,11 @@ are waited for a little longer than the slowest usual frame rate would take."""
 
 _FRAMES_AFTER_US = 50_000
 """Frames this long after the last event still belong to the record; later ones show what no event has seen."""
+_START_US = 1_000
+"""A frame this shortly after the first event still shows what the events began from."""
+
+MAX_SIGMA_DOF = 0.5
+"""The standard error, in depths of focus that the caller told, above which there is no FOCUSED."""
 
 _PATIENT_DROP = 0.2
 """Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
@@ -110,6 +115,7 @@ class SweepSearch:
         self._depth_of_focus_um = depth_of_focus_um if ruler.in_um else None
         self._begin_us = int(sweep.t_us[0]) if begin_us is None else begin_us
         self._reference = reference
+        self._start: NDArray[np.float32] | None = None
         windows: Windows = WindowsByEvents.for_roi(roi)
         if self._depth_of_focus_um is not None:
             windows = WindowsByTravel(ruler, TRAVEL_PER_DEPTH_OF_FOCUS * self._depth_of_focus_um)
@@ -184,10 +190,12 @@ class SweepSearch:
             self._blank = 0
             self._reference = reference
             self._meter.set_reference(reference)
+        if not len(self._frames) and t_us <= self._begin_us + _START_US:
+            self._start = reference.brightness
         if t_us < self._begin_us:
             return None
         exposed = self._ruler.position(t_us - self._sweep.frame_age_us)
-        self._frames.add(t_us, exposed, self._frame_energy.measure(pixels))
+        self._frames.add_bands(t_us, exposed, self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 
@@ -201,7 +209,7 @@ class SweepSearch:
 
     def _frames_are_too_coarse(self) -> bool:
         """Whether frames have seen focus go by and yet have no vertex: the lens is too fast for them to draw a top."""
-        return self._frames.passed and self._frames.vertex() is None
+        return self._frames.passed and self._frames.focus() is None
 
     def _frames_may_come(self, now_us: int) -> bool:
         """Whether a camera that has sent one frame or two may yet show that it sends more."""
@@ -213,7 +221,7 @@ class SweepSearch:
         if self._frames_are_coming(now_us) and not self._frames_are_too_coarse():
             if not self._frames.passed or self._frames.times_us[-1] != now_us:
                 return None
-            vertex = self._frames.vertex()
+            vertex = self._frames.focus()
             if vertex is None or (self._detector.likely_crossing_us is None and self._frames.drop < _PATIENT_DROP):
                 return None
             spacing = float(np.median(np.abs(np.diff(self._frames.positions))))
@@ -224,14 +232,17 @@ class SweepSearch:
         self._attempts += 1
         self._attempts_until = self._detector.samples + max(_RETRY_EVERY, self._attempts)
         brightness = None if self._reference is None else self._reference.brightness
-        said, self._width = self._memory.witnesses(now_us, self._ruler, brightness)
+        said, self._width = self._memory.witnesses(now_us, self._ruler, brightness, self._start)
         if self._memory.depths:
             witnesses = []  # of several planes frames show a mixture
         witnesses += said
         estimate = fuse(witnesses)
         if estimate is None:
             return None
-        limit = self._depth_of_focus_um or self._width_of(witnesses) / WIDTHS_PER_DEPTH_OF_FOCUS
+        # A depth of focus that was told is kept to as in a cycle; one that is read off the curve is itself rough.
+        limit = self._width_of(witnesses) / WIDTHS_PER_DEPTH_OF_FOCUS
+        if self._depth_of_focus_um is not None:
+            limit = MAX_SIGMA_DOF * self._depth_of_focus_um
         return self._decide(estimate, limit, now_us)
 
     def _image_peak_passed(self) -> bool:
@@ -242,9 +253,9 @@ class SweepSearch:
         return agreed or self._memory.track.drop > _PATIENT_DROP
 
     def _width_of(self, witnesses: list[Witness]) -> float:
-        frames = self._frames.vertex() if witnesses and witnesses[0].name == "frames" else None
+        frames = self._frames.focus() if witnesses and witnesses[0].name == "frames" else None
         if frames is not None:
-            return frames.width
+            return frames.finest.width
         return self._width or float("inf")
 
     def _decide(self, estimate: FocusEstimate, limit: float, now_us: int) -> Detection | None:
@@ -253,8 +264,8 @@ class SweepSearch:
             self._doubtful = replace(
                 found,
                 outcome=Outcome.LOW_CONFIDENCE,
-                reason=f"the witnesses leave one standard deviation of {found.sigma_us} us, more than a depth of "
-                "focus; sweep more slowly, or give frames or a larger region",
+                reason=f"the witnesses leave one standard deviation of {found.sigma_us} us, more than the depth of "
+                "focus allows; sweep more slowly, or give frames or a larger region",
             )
             return None
         if found.direction is not Direction.APPROACHING and self._on_the_first_way(now_us):

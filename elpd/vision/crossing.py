@@ -17,57 +17,71 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
-from elpd.vision.depths import find_depths, shares_of_planes
-from elpd.vision.integral import (
-    BANDS_PX,
-    MISMATCH,
-    Vertex,
-    band_energy,
-    band_gain,
-    fit_vertex,
-    group_by_pixel,
-    rebuild_levels,
-)
-from elpd.vision.pairs import Mode, find_pairs, weighted_mode
+from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise, inside
+from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex
+from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
+from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
+from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
+from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from elpd.vision.pairs import Pairs
+    from elpd.vision.lag import LagPrior, Line
 
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
 
-SYSTEMATIC_FRAMES = 0.012
-SYSTEMATIC_VERTEX = 0.08
+SYSTEMATIC_IMAGE = 0.04
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
 
-SYSTEMATIC_UNDER_A_LAMP = 0.09
-"""The same for the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
-
-VERTEX_IN_MOTION = 0.12
-"""What scene motion adds to the vertex' error, where it strays all pairs."""
-
-LAG_UNEXPLAINED = 0.5
-"""How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself."""
+STILL = 0.1
+"""Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
+one that moves it may say so or not, and both are tried."""
 
 ASTRAY = 0.3
 """Share of stray pairs at which nothing that was measured on pairs is believed any more."""
 
-UNMEASURED_LAG_US = 1_500.0
-"""What a photoreceptor's lag may be when nothing tells: tens of microseconds in sunlight, milliseconds in the dark."""
+DOUBT = 3.0
+"""Error of a lag that was measured on nothing but stray pairs, in lags that one may guess."""
 
-COARSE_FRAMES = 0.25
-"""Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
+IMAGE_IN_MOTION = 0.1
+"""What scene motion adds to the error of the events' image, where it strays all pairs."""
+
+HELD_BACK = 4.0
+"""How much the errors of the image grow with the share of what pixels hold back in it."""
+
+LEAST_LEVEL = 1.0 / 3.0
+"""Variance, in thresholds², of what pixels hold back: evenly between minus one and one threshold since their last
+event. An image that does not stand above it at its sharpest shows the sensor, not the scene."""
+
+PAIRS_DEPART = 2.0
+"""Pairs sit on the finest detail: what they depart from focus, in departures of the finest band."""
+
+PAIRS_KERNEL = 0.15
+"""Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
+
+LAG_UNEXPLAINED = 1.0
+"""How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
+which hides most of the difference."""
+
+SYSTEMATIC_UNDER_A_LAMP = 0.09
+"""The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
 
 PERIOD_ERROR = 0.15
 """How far from the middle of a lamp's period its net events may lie in the mean, in periods."""
 
+COARSE_FRAMES = 0.25
+"""Frames further apart than this many widths draw the parabola's flanks, not its top; their error grows with it."""
+
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
+
+WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
+"""Thresholds per unit of log intensity that are tried: sensors have 3 to 20, and losses make it more."""
 
 TICKS = 64
 FEWEST_TICKS = 24
@@ -76,27 +90,21 @@ LEVELS_AT_ONCE = 3 << 18
 
 STILL_SHARE = 0.9
 SAMPLE_PX = 1 << 15
-"""Where so many pairs agree, the scene is still and the pairs, ten times better known, have the say: the vertex then
+"""Where so many pairs agree, the scene is still and the pairs, ten times better known, have the say: the image then
 only has to confirm them, and so many pixels are enough for that."""
 
-FLANK = 0.6
 ROI_MARGIN_PX = 14
-
-PLANE_KERNEL = 0.1
-"""Standard deviation, in widths, of the kernel that finds the mode of one plane's pairs among several planes."""
-
-PLANES_AGREE = 0.5
-"""How far from its pairs the sharpest place of a plane's own part of the picture may be, in shares of the least gap
-of planes: edges that move make clusters of pairs, but sharpen nothing."""
 
 NARROWEST = 0.4
 """Width of a vertex over that of the hill it stands on, below which it is a ripple."""
 
-DARK = 0.04
-"""Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (ten of 255 grey levels)."""
+DARK_OF_MAP = 0.01
+"""The same for a temporal map: it is made of the photocurrents themselves, the dark current is in it already."""
+
+DARK = 0.08
+"""Dark current, relative to the brightest parts: below it a photoreceptor gets no slower (v2e's 20 of 255 levels)."""
 
 _STATIC_SHARE = 0.97
-_MIN_PAIRS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,171 +127,184 @@ class Witness:
 
 
 @dataclass(frozen=True, slots=True)
-class EventStretch:
-    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions."""
+class EventWitnesses:
+    """What the events say: the focus of their image, the mode of their mirror pairs, freed of the typical ``lag``.
 
-    t_us: NDArray[np.int64]
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    on: NDArray[np.uint8]
-    position: NDArray[np.float64]
-    height: int
-    width: int
-    margin: int
-
-
-Groups = tuple["NDArray[np.int64]", "NDArray[np.int64]"]
-"""Events by pixel: ``integral.group_by_pixel``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Lag:
-    """How far the lens went while the brightest photoreceptors answered, and one standard error.
-
-    A pixel ``s`` times slower than the brightest is late by ``s`` times this.
-    ``typical`` is the mean slowness of the pixels that had a say.
+    ``held_back`` is the variance of what pixels keep to themselves, for less than a threshold, over the image's.
     """
 
-    at: float = 0.0
-    sigma: float = 0.0
-    typical: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class EventWitnesses:
-    """What the events say: the vertex of their image's log S, the mode of their mirror pairs."""
-
-    vertex: Vertex | None
+    image: BandFocus | None
     pairs: Mode | None
     lag: Lag
+    held_back: float = 0.0
     depths: tuple[float, ...] = ()
     """Where planes of the region are in focus, nearest first along the sweep, if there are several. Then ``pairs`` are
-    those of the first, and there is no vertex: sharpness shows none of them."""
+    those of the first, and there is no image: sharpness shows none of them."""
     plane_width: float = 0.0
     """Width of one plane's curve, as far as its rising flank tells, where there are several."""
 
-    def witnesses(
-        self, unmeasured_lag: float = 0.0, unexplained: float = LAG_UNEXPLAINED, width: float | None = None
-    ) -> list[Witness]:
+    def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
 
-        *unmeasured_lag* is what a photoreceptor's lag may amount to where it could not be measured, *unexplained* the
-        share of a measured one that may be wrong. *width* is the curve's own, where it is known beforehand; without
-        it, pairs are believed only beside a vertex.
+        *unexplained* is the share of the lag that may be wrong. *width* is the curve's own, where it is known
+        beforehand; without it, pairs are believed only beside an image.
         """
         found: list[Witness] = []
-        if self.vertex is None and width is None:
+        if self.image is None and width is None:
             return found
-        width = width if width is not None or self.vertex is None else self.vertex.width
+        width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
-        shared = unmeasured_lag
-        if self.lag.sigma > 0.0:
-            shared = self.lag.typical * float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
-        # In a still scene nearly all pairs agree. What disagrees measures how much of the rest is not focus.
-        stray = max(0.0, _STATIC_SHARE - self.pairs.share) if self.pairs is not None else 1.0
-        # The lag was measured on the pairs: as far as they are astray, it was not.
-        shared = float(np.hypot(shared, min(1.0, stray / ASTRAY) * unmeasured_lag))
-        if self.vertex is not None:
-            sigma = float(np.hypot(self.vertex.sigma, (SYSTEMATIC_VERTEX + VERTEX_IN_MOTION * stray) * width))
-            found.append(Witness("vertex", self.vertex.at, sigma, shared))
-        if self.pairs is not None and self.pairs.count >= _MIN_PAIRS:
-            sigma = float(np.hypot(self.pairs.sigma, (SYSTEMATIC_PAIRS + stray) * width))
-            found.append(Witness("pairs", self.pairs.at, sigma, shared))
+        shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
+        stray = _stray(self.pairs)
+        departure = 0.0
+        if self.image is not None:
+            departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
+            own = (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * (1.0 + HELD_BACK * self.held_back)
+            sigma = float(np.hypot(self.image.sigma, own * width))
+            found.append(Witness("vertex", self.image.at, sigma, shared))
+        if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
+            systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
+            found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
         return found
 
 
+def _stray(pairs: Mode | None) -> float:
+    """Return which share of pairs disagrees beyond what does in a still scene: how much of the rest is not focus."""
+    return max(0.0, _STATIC_SHARE - pairs.share) if pairs is not None else 1.0
+
+
 def ask_events(
-    events: EventStretch, begin: float, peak: float, end: float, brightness: NDArray[np.float32] | None = None
+    events: EventStretch,
+    begin: float,
+    peak: float,
+    end: float,
+    brightness: NDArray[np.float32] | None = None,
+    unmeasured_lag: float = 0.0,
+    start: NDArray[np.float32] | None = None,
+    calibrated: LagPrior | None = None,
+    dark: float = DARK,
 ) -> EventWitnesses:
-    """Rebuild the image over positions *begin* .. *end* and find the vertex near *peak*, and the mirror pairs.
+    """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
     *brightness*, (height, width) of the cut-out, relative to the brightest parts, tells how slow each pixel's
-    photoreceptor is; with it, the pairs themselves measure the lag, and both witnesses are freed of it.
+    photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
+    typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
+    *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
+    *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
+    *brightness* does not show, relative to the brightest parts.
     """
-    weight, slowness = _by_brightness(brightness, events)
-    groups = _by_pixel(events)
-    at_peak, _ = _rebuilt(events, groups, np.array([peak]))
+    weight, slowness = _by_brightness(brightness, events, dark)
+    groups = by_pixel(events)
+    at_peak = rebuilt(events, groups, np.array([peak]))[0]
+    slownesses = _slownesses(start, at_peak, slowness)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
-    pairs, lag = _pair_mode(found, at_peak[0], peak, end, slowness)
-    planes = _planes(found, events, at_peak[0], (begin, peak, end), lag.at * slowness)
+    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated)
+    planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
     if planes:
-        return EventWitnesses(None, planes[0], lag, tuple(plane.at for plane in planes), _flank_width(begin, peak))
+        depths = tuple(plane.at for plane in planes)
+        return EventWitnesses(None, planes[0], late.typical, 0.0, depths, flank_width(begin, peak))
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
-        rows = _busiest_rows(events)
-        events, weight, slowness = _rows_of(events, rows), weight[rows], slowness[rows]
-        groups = _by_pixel(events)
+        rows = busiest_rows(events, SAMPLE_PX)
+        events, weight, at_peak = rows_of(events, rows), weight[rows], at_peak[rows]
+        slownesses = [one[rows] for one in slownesses]
+        start = None if start is None else start[rows]
+        groups = by_pixel(events)
     pixels = max(1, events.height * events.width)
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
-    vertex = None
-    if lag.at > 0.0:
-        quick = replace(events, position=events.position - lag.at * slowness[events.y, events.x])
-        vertex = _vertex(quick, groups, ticks, weight, peak)
-    if vertex is None:
-        vertex = _vertex(events, groups, ticks, weight, peak)
-    return EventWitnesses(vertex, pairs, lag)
-
-
-def _by_pixel(events: EventStretch) -> Groups:
-    return group_by_pixel(events.y.astype(np.int64) * events.width + events.x, max(1, events.height * events.width))
-
-
-def _busiest_rows(events: EventStretch) -> slice:
-    """Return a stretch of rows of at most ``SAMPLE_PX`` pixels, that with the most events."""
-    count = min(events.height, max(SAMPLE_PX // events.width, 4 * events.margin))
-    below = np.concatenate([[0], np.cumsum(np.bincount(events.y, minlength=events.height))])
-    first = int(np.argmax(below[count:] - below[:-count]))
-    return slice(first, first + count)
-
-
-def _rows_of(events: EventStretch, rows: slice) -> EventStretch:
-    inside = (events.y >= rows.start) & (events.y < rows.stop)
-    return EventStretch(
-        events.t_us[inside],
-        events.x[inside],
-        (events.y[inside] - rows.start).astype(np.uint16),
-        events.on[inside],
-        events.position[inside],
-        rows.stop - rows.start,
-        events.width,
-        events.margin,
+    images = rebuilt(events, groups, ticks)
+    first = _image_focus(_curves(images, None, weight, events.margin)[0], ticks, peak)
+    curves = [] if _stray(pairs) < STILL else _curves(images, start, weight, events.margin)
+    hush(images, ticks, events, peak if first is None else first.finest.at)
+    curves += _curves(images, start, weight, events.margin)
+    candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
+    image = average_focus(candidates) if candidates else None
+    energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
+    lags = (
+        [
+            Lag(float(np.average(slow, weights=energy)) * one.at, float(np.average(slow, weights=energy)) * one.sigma)
+            for slow, one in zip(slownesses, late.candidates, strict=True)
+        ]
+        if energy.any()
+        else late.candidates
     )
+    lag = average_lag(lags, late.weights)
+    if image is not None:
+        image = replace(image, at=image.at - lag.at)
+    seen = float((energy[inside(energy.shape, events.margin)]).mean())
+    return EventWitnesses(image, pairs, lag, LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12))
 
 
 def _by_brightness(
-    brightness: NDArray[np.float32] | None, events: EventStretch
+    brightness: NDArray[np.float32] | None, events: EventStretch, dark: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return each pixel's say in S, and its slowness: how many times slower than the brightest its receptor is."""
     if brightness is None:
         shape = (events.height, events.width)
-        return np.ones(shape, dtype=np.float32), np.zeros(shape)
-    smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(DARK)
+        return np.ones(shape, dtype=np.float32), np.ones(shape)
+    smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(dark)
     weight = np.asarray(smooth / np.float32(smooth.mean()), dtype=np.float32)
-    return weight, (1.0 + DARK) / (np.maximum(brightness, 0.0).astype(np.float64) + DARK)
+    return weight, (1.0 + dark) / (np.maximum(brightness, 0.0).astype(np.float64) + dark)
 
 
-def _vertex(
-    events: EventStretch, groups: Groups, ticks: NDArray[np.float64], weight: NDArray[np.float32], peak: float
-) -> Vertex | None:
-    curve = _rebuilt_curve(events, groups, ticks, weight)
+def _slownesses(
+    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Return candidates of how slow each pixel is: as in the picture, and as it was in focus, by its events.
+
+    A pixel is as slow as the light that it has when it answers, and the start picture was blurred. What its events are
+    worth in log intensity nobody knows.
+    """
+    if start is None:
+        return [slowness]
+    found = [slowness]
+    for worth in WORTHS:
+        bright = np.maximum(start.astype(np.float64), 0.0) + DARK
+        lit = bright * np.exp(np.clip(level.astype(np.float64) / worth, -5.0, 5.0))
+        found.append((1.0 + DARK) / np.clip(lit, DARK, 1.0 + DARK))
+    return found
+
+
+def _curves(
+    images: NDArray[np.float32], start: NDArray[np.float32] | None, weight: NDArray[np.float32], margin: int
+) -> list[NDArray[np.float64]]:
+    """Return candidates of log S, (ticks, bands): of the images as they are, and with the start picture below them.
+
+    Events count changes since their first; what was there before, the blurred start picture, is missing. In a still
+    scene that is as symmetric in defocus as the picture itself. In one that moves, the picture wanders over what is
+    missing, and S wavers. How many thresholds a unit of log intensity is worth nobody knows, so several are tried.
+    """
+    own = np.array([band_products(image, image, weight, margin) for image in images])
+    curves = [own]
+    if start is not None:
+        below = np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32)
+        mixed = np.array([band_products(image, below, weight, margin) for image in images])
+        under = band_products(below, below, weight, margin)
+        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in WORTHS]
+    return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
+
+
+def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float) -> BandFocus | None:
+    """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record."""
     end = float(ticks[-1])
-    wide = fit_vertex(ticks, curve, end - float(ticks[0]))
-    vertex = None
-    if wide is not None:
-        use = ticks <= end - UNANSWERED * wide.width
-        if int(use.sum()) >= 5:
-            vertex = fit_vertex(ticks[use], curve[use], 0.7 * wide.width)
-    if vertex is not None and vertex.at > end - (UNANSWERED + 0.2) * vertex.width:
-        vertex = None
+    wide = fit_vertex(ticks, curve[:, 0], end - float(ticks[0]))
+    if wide is None:
+        return None
+    use = ticks <= end - UNANSWERED * wide.width
+    if int(use.sum()) < 5:
+        return None
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width)
+    if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
+        return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
-    if vertex is not None and vertex.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
-        vertex = None
-    return vertex
+    if found.finest.width < NARROWEST * (peak - float(ticks[0])) / float(np.sqrt(2.0 * FLANK)):
+        return None
+    return found
 
 
-def frame_witness(vertex: Vertex, spacing: float) -> Witness:
+def frame_witness(vertex: BandFocus, spacing: float) -> Witness:
     """Return what frames say, taken every *spacing* along the sweep."""
-    coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.width))
-    return Witness("frames", vertex.at, float(np.hypot(vertex.sigma, SYSTEMATIC_FRAMES * coarseness * vertex.width)))
+    coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.finest.width))
+    return Witness("frames", vertex.at, coarseness * vertex.sigma)
 
 
 def lamp_witness(vertex: Vertex, width: float, spacing: float) -> Witness:
@@ -319,122 +340,55 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     return FocusEstimate(focus, sigma, "pairs" if main == "pairs" else "crossing", contributions)
 
 
-def _rebuilt_curve(
-    events: EventStretch, groups: Groups, ticks: NDArray[np.float64], weight: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """Return log S of the rebuilt image at each tick, the mean of the bands."""
-    images, mismatch = _rebuilt(events, groups, ticks)
-    curve = np.zeros(ticks.size)
-    for band in BANDS_PX:
-        energy = np.array([band_energy(image, band, weight, events.margin) for image in images])
-        energy = np.maximum(energy - band_gain(band) * mismatch, 1e-3 * energy)
-        curve += np.log(energy + 1e-12) / len(BANDS_PX)
-    return curve
+@dataclass(frozen=True, slots=True)
+class _Lateness:
+    """The lag of the brightest under each candidate for slowness, and how well each explains the pairs."""
 
-
-def _rebuilt(
-    events: EventStretch, groups: Groups, ticks: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the image at each tick, in thresholds, and the variance that unequal thresholds add to it."""
-    pixels = events.height * events.width
-    level = np.empty((ticks.size, pixels), dtype=np.float32)
-    squares = np.zeros((ticks.size, 2))
-    starts, order = groups
-    rebuild_levels(starts, events.position[order], events.on[order], ticks, level, squares)
-    return level.reshape(ticks.size, events.height, events.width), MISMATCH**2 * squares.sum(axis=1) / pixels
+    candidates: list[Lag]
+    weights: NDArray[np.float64]
+    typical: Lag
+    """What it makes of the pixels that turned, on the average."""
 
 
 def _pair_mode(
-    pairs: Pairs, level: NDArray[np.float32], peak: float, end: float, slowness: NDArray[np.float64]
-) -> tuple[Mode | None, Lag]:
-    if pairs.on.size == 0:
-        return None, Lag()
+    pairs: Pairs,
+    level: NDArray[np.float32],
+    peak: float,
+    end: float,
+    slownesses: list[NDArray[np.float64]],
+    unmeasured_lag: float,
+    calibrated: LagPrior | None,
+) -> tuple[Mode | None, _Lateness]:
+    """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
-    sign = 2.0 * pairs.on - 1.0
     past = end - peak
-    believed = (sign * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
+    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
     weights = (np.abs(curvature) / gap)[believed]
     middle = pairs.middle[believed]
-    mode = weighted_mode(middle, weights, 0.15 * past)
-    if mode is None or not slowness.any():
-        return mode, Lag()
-    return without_lag(middle, weights, slowness[pairs.y, pairs.x][believed], mode, 0.15 * past)
+    mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
+    if mode is None:
+        unknown = [_lag_of(None, unmeasured_lag / float(one.mean()), calibrated) for one in slownesses]
+        return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
+    near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
+    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
+    typical = [float(np.average(one, weights=near)) for one in slow]
+    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past) for one in slow]
+    # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
+    doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
+    late = [
+        _lag_of(
+            None if line is None else replace(line, sigma=float(np.hypot(line.sigma, doubt / one))),
+            unmeasured_lag / one,
+            calibrated,
+        )
+        for line, one in zip(lines, typical, strict=True)
+    ]
+    fit = weights_of_lines(lines)
+    lag = average_lag([Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)], fit)
+    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit, lag)
 
 
-def _flank_width(begin: float, peak: float) -> float:
-    """Return the width of a curve that rose by ``FLANK`` from *begin* to *peak*."""
-    return (peak - begin) / float(np.sqrt(2.0 * FLANK))
-
-
-def _planes(
-    pairs: Pairs,
-    events: EventStretch,
-    level: NDArray[np.float32],
-    stretch: tuple[float, float, float],
-    late: NDArray[np.float64],
-) -> list[Mode]:
-    """Return where planes of the region are in focus, if there are several.
-
-    *stretch* is where the curve's rising flank, its peak and the record's end lie, *late* each pixel's lag. The planes'
-    own parts of the picture must be sharpest where their pairs say.
-    """
-    begin, peak, end = stretch
-    width = _flank_width(begin, peak)
-    curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
-    middle = pairs.middle - late[pairs.y, pairs.x]
-    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (middle >= begin - width)
-    weights = (np.abs(curvature) / np.maximum(pairs.after - pairs.before, 1e-3 * width))[believed]
-    middle = middle[believed]
-    clusters = find_depths(middle, weights, pairs.x[believed], pairs.y[believed], width)
-    held = sum(float(weights[one].sum()) for one in clusters) / max(float(weights.sum()), 1e-300)
-    modes = [weighted_mode(middle[one], weights[one], PLANE_KERNEL * width) for one in clusters]
-    known = [replace(mode, share=held) for mode in modes if mode is not None and mode.count >= _MIN_PAIRS]
-    if len(known) < 2 or len(known) < len(modes):
-        return []
-    shares = shares_of_planes(clusters, pairs.x[believed], pairs.y[believed], level.shape)
-    ticks, groups = np.linspace(begin - width, end, TICKS), _by_pixel(events)
-    tops = [float(ticks[int(np.argmax(_rebuilt_curve(events, groups, ticks, share)))]) for share in shares]
-    places = np.array([mode.at for mode in known])
-    allowed = PLANES_AGREE * float(np.diff(places).min())
-    # Each part must be sharpest where its pairs say, and the parts as far apart as the pairs.
-    astray = np.concatenate([np.abs(tops - places), np.abs(np.diff(tops) - np.diff(places))])
-    return known if bool((astray <= allowed).all()) else []
-
-
-def without_lag(
-    middle: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    slowness: NDArray[np.float64],
-    mode: Mode,
-    width: float,
-) -> tuple[Mode, Lag]:
-    """Fit ``middle = focus + lag·slowness`` robustly (Tukey's biweight around the mode); the lag is not negative.
-
-    A lag that is not significant is shrunk by its own error, so that a scene without bright and dark pixels keeps its
-    mode and gains nothing but an honest error.
-    """
-    focus, lag = mode.at, 0.0
-    design = np.stack([np.ones_like(slowness), slowness], axis=1)
-    covariance = np.zeros((2, 2))
-    for _ in range(25):
-        residual = middle - focus - lag * slowness
-        biweight = weights * np.square(np.maximum(0.0, 1.0 - np.square(residual / (3.0 * width))))
-        normal = design.T @ (design * biweight[:, None])
-        if biweight.sum() <= 0.0 or np.linalg.cond(normal) > 1e12:
-            return mode, Lag()
-        inverse = np.linalg.inv(normal)
-        before = focus, lag
-        focus, lag = (float(one) for one in inverse @ (design.T @ (biweight * middle)))
-        residual = middle - focus - lag * slowness
-        scores = design * (biweight * residual)[:, None]
-        covariance = inverse @ (scores.T @ scores) @ inverse
-        if abs(focus - before[0]) + abs(lag - before[1]) < 1e-6 * width:
-            break
-    sigma_lag = float(np.sqrt(covariance[1, 1]))
-    typical = float(np.average(slowness, weights=biweight))
-    kept = lag**2 / (lag**2 + sigma_lag**2) if lag > 0.0 else 0.0
-    centre = focus + lag * typical
-    answer = centre - kept * lag * typical
-    sigma = float(np.hypot(np.sqrt(max(covariance[0, 0], 0.0)), (1.0 - kept) * max(lag, 0.0) * typical))
-    return Mode(answer, sigma, mode.count, mode.share), Lag(kept * lag, sigma_lag, typical)
+def _lag_of(line: Line | None, expected: float, calibrated: LagPrior | None) -> Lag:
+    """Return the lag by the pairs and what is known beforehand: a calibration, or photoreceptors at large."""
+    return expected_lag(line, expected) if calibrated is None else calibrated.with_line(line)

@@ -25,11 +25,8 @@ from elpd.events.jit import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-BANDS_PX = (0.8, 1.2)
+BANDS_PX = (0.8, 1.2, 1.8, 2.7)
 """Inner standard deviations of the difference-of-Gaussian bands; the outer is 1.6 times larger."""
-
-MISMATCH = 0.15
-"""Standard deviation of the contrast threshold over pixels, relative; 0.1 to 0.2 in all sensors that publish it."""
 
 _BAND_RATIO = 1.6
 
@@ -100,14 +97,13 @@ def stamp_events(
                 target[column] += sign * source[column]
 
 
-@kernel("void(int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1], float64[:, ::1])")
+@kernel("void(int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1])")
 def rebuild_levels(
     starts: NDArray[np.int64],
     position: NDArray[np.float64],
     on: NDArray[np.uint8],
     ticks: NDArray[np.float64],
     level: NDArray[np.float32],
-    squares: NDArray[np.float64],
 ) -> None:
     """Rebuild each pixel's level at each tick from its events, without the hysteresis of the sensor.
 
@@ -121,8 +117,6 @@ def rebuild_levels(
         Positions at which the levels are wanted, rising.
     level:
         Output, (ticks, pixels): level in thresholds, zero at the beginning.
-    squares:
-        Output, (ticks, 2): sum over pixels of n_on² and of n_off² up to each tick; added to.
     """
     n_ticks = ticks.size
     for k in range(starts.size - 1):
@@ -131,8 +125,6 @@ def rebuild_levels(
         tick = 0
         value = 0.0
         at = -1e300  # where the last knot lies; before the first event the level is constant
-        n_on = 0
-        n_off = 0
         for i in range(begin, end):
             here = position[i]
             step = 1.0 if on[i] else -1.0
@@ -152,25 +144,15 @@ def rebuild_levels(
                     at = last
                 while tick < n_ticks and ticks[tick] < at:
                     level[tick, k] = value
-                    squares[tick, 0] += n_on * n_on
-                    squares[tick, 1] += n_off * n_off
                     tick += 1
                 width = here - at
                 while tick < n_ticks and ticks[tick] < here:
                     part = (ticks[tick] - at) / width if width > 0.0 else 1.0
                     level[tick, k] = value + step * part
-                    squares[tick, 0] += n_on * n_on
-                    squares[tick, 1] += n_off * n_off
                     tick += 1
             value += step
-            if on[i]:
-                n_on += 1
-            else:
-                n_off += 1
         while tick < n_ticks:
             level[tick, k] = value
-            squares[tick, 0] += n_on * n_on
-            squares[tick, 1] += n_off * n_off
             tick += 1
 
 

@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import FLANK, ROI_MARGIN_PX, UNMEASURED_LAG_US, EventStretch, ask_events
+from elpd.vision.crossing import DARK, LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.lag import UNMEASURED_LAG_US, LagPrior
+from elpd.vision.planes import FLANK
+from elpd.vision.rebuilt import EventStretch
 from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import EventEnergy, PeakTrack
 
@@ -35,10 +38,6 @@ MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
 FIRST_CAPACITY = 1 << 17
-
-LEAST_LEVEL = 1.0 / 3.0
-"""Variance, in thresholds², of what pixels hold back (evenly between minus one and one threshold since their last
-event). An image that does not stand above it at its sharpest shows the sensor, not the scene."""
 
 LEAST_ORDER = 0.75
 """Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
@@ -147,8 +146,8 @@ class EventMemory:
         return times
 
     def refractory(self) -> Refractory:
-        """Return how long a pixel is deaf after an event, as far as the events tell."""
-        t_us, x, y, _ = (column[: self._count] for column in self._columns)
+        """Return how long a pixel is deaf after an event, as far as the events up to the last ``advance`` tell."""
+        t_us, x, y, _ = (column[: self._taken] for column in self._columns)
         return refractory_period(t_us, x, y, self._shape)
 
     def flicker(self) -> Flicker | None:
@@ -187,12 +186,19 @@ class EventMemory:
         return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
 
     def ask(
-        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None, deaf_us: float = 0.0
+        self,
+        now_us: int,
+        ruler: Ruler,
+        brightness: NDArray[np.float32] | None = None,
+        deaf_us: float = 0.0,
+        start: NDArray[np.float32] | None = None,
+        dark: float = DARK,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
-        *brightness* is that of the whole sensor (``Reference.brightness``); events are dated *deaf_us* later, to the
-        release of their pixels. ``None`` when there is nothing to ask.
+        *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
+        show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
+        that the sensor saw when it sent the first of them. ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -209,24 +215,49 @@ class EventMemory:
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX)
-        if brightness is not None:
-            brightness = np.ascontiguousarray(brightness[self._top : self._bottom, self._left : self._right])
+        if begin > 0 or self._forgotten:
+            start = None
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
-        return ask_events(events, flank, peak, now, brightness)
+        return ask_events(
+            events,
+            flank,
+            peak,
+            now,
+            self._cut(brightness),
+            UNMEASURED_LAG_US * ruler.speed_at(peak_us),
+            self._cut(start),
+            LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
+            dark,
+        )
+
+    def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
+        if picture is None:
+            return None
+        return np.ascontiguousarray(picture[self._top : self._bottom, self._left : self._right])
 
     def witnesses(
-        self, now_us: int, ruler: Ruler, brightness: NDArray[np.float32] | None = None
+        self,
+        now_us: int,
+        ruler: Ruler,
+        brightness: NDArray[np.float32] | None = None,
+        start: NDArray[np.float32] | None = None,
     ) -> tuple[list[Witness], float | None]:
         """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
-        said = self.ask(now_us, ruler, brightness)
+        deaf = self.refractory()
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start)
         self.depths = ()
-        if said is None or (said.vertex is None and not said.depths):
+        if said is None or (said.image is None and not said.depths):
             return [], None
         _, _, sign = ruler.stretch(now_us)
-        lag = UNMEASURED_LAG_US * ruler.speed_at(now_us)
+        undated = deaf.sigma_us * ruler.speed_at(now_us)
         self.depths = tuple(sign * at for at in said.depths)
-        width = said.plane_width if said.vertex is None else said.vertex.width
-        return [replace(one, at=sign * one.at) for one in said.witnesses(lag, width=width)], width
+        width = said.plane_width if said.image is None else said.image.finest.width
+        witnesses = [
+            replace(one, at=sign * one.at, shared=float(np.hypot(one.shared, undated)))
+            for one in said.witnesses(width=width)
+        ]
+        return witnesses, width
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:

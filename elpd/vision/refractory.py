@@ -36,8 +36,16 @@ MAX_PERIOD_US = 5_000.0
 GRID_COUNT = 250
 """So many intervals exactly alike and shortest, and the time stamps are on a grid: it hides the period."""
 
-CROWDING = 3.0
-"""How many times more intervals in the farther half above the shortest than in the nearer half are a crowd."""
+EVEN_OVER = 69
+FEWEST_ABOVE = 8
+EVEN_SIGMAS = 2.0
+"""So many intervals above the shortest are looked at, and must not crowd towards their end by so many deviations."""
+
+TOGETHER_US = 16.0
+"""Closer together than this all of them are at the period, and whole microseconds say nothing of how they lie."""
+
+UNKNOWN_US = 500.0
+"""Standard deviation of a period of which nothing is learnt: sensors are set to some tenths of a millisecond."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +106,15 @@ def refractory_period(
     if count < MIN_INTERVALS or least_us > MAX_PERIOD_US or shortest_us[0] == shortest_us[GRID_COUNT]:
         return Refractory()
     top_us = min(1.5 * least_us, float(shortest_us[-1]))
-    if top_us <= least_us:
-        return Refractory()
-    first, second = np.diff(np.searchsorted(shortest_us, [least_us, 0.5 * (least_us + top_us), top_us]))
-    if first + second == 0 or second > CROWDING * (first + 2):
-        return Refractory(0.0, 0.5 * least_us)
-    per_us = float(first + second) / (top_us - least_us)
-    return Refractory(max(0.0, least_us - ORDER / per_us), min(0.5 * least_us, float(np.sqrt(ORDER)) / per_us))
+    above = (shortest_us[ORDER:EVEN_OVER] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
+    above = above[: max(FEWEST_ABOVE, int(np.searchsorted(above, 1.0, side="right")))]
+    bound_us = min(0.5 * least_us, UNKNOWN_US)
+    if above.size < FEWEST_ABOVE:
+        return Refractory(0.0, bound_us)
+    # Evenly spread, they lie at half their range on average; what is set by edges in view crowds towards its end.
+    reach = max(float(above.max()), 1.0 / (top_us - least_us))
+    lie = float(above.mean()) / reach
+    if reach * (top_us - least_us) > TOGETHER_US and lie > 0.5 + EVEN_SIGMAS / np.sqrt(12.0 * above.size):
+        return Refractory(0.0, bound_us)
+    per_us = float(above.size / (reach * (top_us - least_us)))
+    return Refractory(max(0.0, least_us - ORDER / per_us), min(bound_us, float(np.sqrt(ORDER)) / per_us))

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from elpd.vision.bands import band_energies, focus_of_bands
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
-    band_energy,
     band_stamp,
     fit_vertex,
     inside_margin,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Roi
+    from elpd.vision.bands import BandFocus
 
 DROP = 0.10
 """Fall of log S that makes a peak a peak: the blur of 0.45 widths of the curve, under three depths of focus."""
@@ -48,9 +49,15 @@ class PeakTrack:
         self.times_us: list[int] = []
         self.positions: list[float] = []
         self.values: list[float] = []
+        self._bands: list[NDArray[np.float64]] = []
         self._peak = 0
         self._lowest_before_peak = float("inf")
         self._lowest = float("inf")
+
+    def add_bands(self, t_us: int, position: float, bands: NDArray[np.float64]) -> None:
+        """Append a point of which all bands are known: the finest is the curve, all of them tell the focus."""
+        self._bands.append(bands)
+        self.add(t_us, position, float(bands[0]))
 
     def add(self, t_us: int, position: float, value: float) -> None:
         """Append a point; times rise."""
@@ -136,6 +143,20 @@ class PeakTrack:
         moved = 0.0 if narrow is None else abs(narrow.at - vertex.at)
         return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))
 
+    def focus(self) -> BandFocus | None:
+        """Return the focus of parabolas through what lies within ``FIT_DROP`` of the peak, of points with all bands."""
+        if len(self._bands) != len(self) or len(self) < 3:
+            return None
+        begin = self.flank(2.0 * FIT_DROP)
+        z = np.array(self.positions[begin:])
+        bands = np.array(self._bands[begin:])
+        sign = -1.0 if z[-1] < z[0] else 1.0
+        wide = fit_vertex(sign * z, bands[:, 0], float(np.ptp(z)))
+        if wide is None:
+            return None
+        found = focus_of_bands(sign * z, bands, wide.width * float(np.sqrt(2.0 * FIT_DROP)))
+        return None if found is None else found.mirrored(sign)
+
 
 class FrameEnergy:
     """``log S`` of whole frames over a region, weighted by the brightness of the first."""
@@ -145,8 +166,8 @@ class FrameEnergy:
         self._margin = margin
         self._weight: NDArray[np.float32] | None = None
 
-    def measure(self, pixels: NDArray[np.generic]) -> float:
-        """Return log S of a frame, 8 or 16 bit."""
+    def measure(self, pixels: NDArray[np.generic]) -> NDArray[np.float64]:
+        """Return log S of a frame, 8 or 16 bit, in each band."""
         roi, margin = self._roi, self._margin
         top, left = max(0, roi.y - margin), max(0, roi.x - margin)
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
@@ -157,8 +178,8 @@ class FrameEnergy:
             self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
-        energy = band_energy(np.log(image + np.float32(_FRAME_GROUND)), BANDS_PX[0], self._weight * inside)
-        return float(np.log(energy + _FLOOR))
+        energies = band_energies(np.log(image + np.float32(_FRAME_GROUND)), self._weight * inside)
+        return np.asarray(np.log(energies + _FLOOR))
 
 
 class EventEnergy:

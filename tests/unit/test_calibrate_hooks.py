@@ -1,4 +1,4 @@
-"""What a profile changes: hot pixels are not heard, the lag is known, the mismatch is the sensor's own."""
+"""What a profile changes: hot pixels are not heard, the lag is known."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from elpd.records import Geometry, Roi, SensorProfile
-from elpd.vision.crossing import LagPrior, without_lag
 from elpd.vision.filters import PixelCap
+from elpd.vision.lag import Lag, LagPrior, Line, line_of_classes
 from elpd.vision.memory import EventMemory
-from elpd.vision.pairs import Mode, weighted_mode
 
 GEOMETRY = Geometry(64, 48)
 
@@ -37,38 +36,31 @@ def test_the_memory_leaves_hot_pixels_of_its_region_out() -> None:
     assert kept == [0, 20]
 
 
-def crossings(lag_um: float, spread: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mode]:
-    """Pairs of a scene whose pixels are 1 to *spread* times slower than the brightest; focus at 10 um."""
+def pairs_line(lag_um: float, spread: float, seed: int) -> Line | None:
+    """What pairs say of a scene whose pixels are 1 to *spread* times slower than the brightest; focus at 10 um."""
     random = np.random.default_rng(seed)
     slowness = random.uniform(1.0, spread, 400)
     middle = 10.0 + lag_um * slowness + random.normal(0.0, 0.5, 400)
-    weights = np.ones(400)
-    mode = weighted_mode(middle, weights, 5.0)
-    assert mode is not None
-    return middle, weights, slowness, mode
+    return line_of_classes(middle, np.ones(400), slowness, 10.0 + lag_um, 5.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_calibrated_lag_is_used_where_the_scene_cannot_tell_it(seed: int) -> None:
-    middle, weights, slowness, mode = crossings(2.0, 1.05, seed)
     prior = LagPrior.of(SensorProfile(lag_us=500.0, lag_sigma_us=20.0), 4e-3)
     assert prior is not None
     assert prior.at == pytest.approx(2.0)
-    found, lag = without_lag(middle, weights, slowness, mode, 5.0, prior)
-    blind, _ = without_lag(middle, weights, slowness, mode, 5.0)
-    assert lag.calibrated
-    error_um = np.hypot(found.sigma, lag.sigma * lag.typical)
-    assert abs(found.at - 10.0) < 3 * error_um
-    assert error_um < 1.3  # half of the lag: the light may be another
-    assert abs(found.at - 10.0) < max(abs(blind.at - 10.0), 1.0)
+    lag = prior.with_line(pairs_line(2.0, 1.05, seed))
+    assert lag.sigma < 1.1  # half of the lag: the light may be another
+    assert abs(lag.at - 2.0) < 3 * lag.sigma
 
 
 def test_a_scene_that_tells_its_lag_outvotes_the_calibration() -> None:
-    middle, weights, slowness, mode = crossings(1.0, 6.0, 1)
     prior = LagPrior.of(SensorProfile(lag_us=750.0, lag_sigma_us=100.0), 4e-3)
-    found, lag = without_lag(middle, weights, slowness, mode, 5.0, prior)
+    assert prior is not None
+    lag = prior.with_line(pairs_line(1.0, 6.0, 1))
     assert lag.at == pytest.approx(1.0, abs=0.1)
-    assert abs(found.at - 10.0) < 3 * np.hypot(found.sigma, lag.sigma * lag.typical)
+    assert lag.sigma < 0.2
+    assert prior.with_line(None) == Lag(prior.at, prior.sigma)
 
 
 def test_without_a_lag_there_is_no_prior() -> None:

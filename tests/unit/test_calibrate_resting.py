@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from elpd_drivers.sim.optics import Lamp
 from sensor_evidence import rest_of
 from sim_rigs import Setup
 
@@ -60,7 +61,7 @@ def test_hundreds_of_hot_pixels_do_not_hide_each_other() -> None:
 
 
 def test_a_scene_that_is_not_at_rest_is_no_noise() -> None:
-    setup = Setup(seed=1, size=SIZE, light={"flicker_hz": 100.0, "flicker_depth": 0.4})
+    setup = Setup(seed=1, size=SIZE, light={"lamp": Lamp(100.0, 0.4)})
     found = measure_rest(rest_of(setup, 0.5), Geometry(*SIZE))
     assert found.on_hz.value is None
     assert "not at rest" in str(found.on_hz)

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elpd.vision.crossing import Witness, frame_witness, fuse, without_lag
+from elpd.vision.bands import BandFocus, average_focus, band_energies, focus_of_bands
+from elpd.vision.crossing import Witness, frame_witness, fuse
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
@@ -19,7 +20,7 @@ from elpd.vision.integral import (
     rebuild_levels,
     stamp_events,
 )
-from elpd.vision.pairs import weighted_mode
+from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
 from elpd.vision.track import EventEnergy, PeakTrack
 
 
@@ -31,17 +32,11 @@ def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
     ticks = np.linspace(-0.1, position[-1] + 0.5, 17)
     starts, order = group_by_pixel(pixel, 3)
     level = np.zeros((17, 3), np.float32)
-    squares = np.zeros((17, 2))
-    rebuild_levels(starts, position[order], on[order], ticks, level, squares)
+    rebuild_levels(starts, position[order], on[order], ticks, level)
     for k in range(3):
         events = [(float(z), bool(p)) for z, p, one in zip(position, on, pixel, strict=True) if one == k]
         expected = [naive_vision.level_at(events, tick) if events else 0.0 for tick in ticks]
         np.testing.assert_allclose(level[:, k], expected, rtol=1e-5, atol=1e-5)
-    counted = [
-        [sum(((pixel == k) & (on == p) & (position <= tick)).sum() ** 2 for k in range(3)) for p in (1, 0)]
-        for tick in ticks
-    ]
-    np.testing.assert_array_equal(squares, counted)
 
 
 @given(st.lists(st.integers(0, 6), max_size=60))
@@ -125,36 +120,98 @@ def test_an_error_that_is_shared_does_not_average_out() -> None:
 
 
 def test_frames_far_apart_are_trusted_less() -> None:
-    vertex = Vertex(0.0, 0.0, 80.0, 5)
-    assert frame_witness(vertex, 80.0).sigma > 3.0 * frame_witness(vertex, 16.0).sigma
+    focus = BandFocus(0.0, 0.5, Vertex(0.0, 0.5, 80.0, 5), 0.0, 0.1)
+    assert frame_witness(focus, 80.0).sigma > 3.0 * frame_witness(focus, 16.0).sigma
 
 
-def test_the_lag_of_dark_pixels_is_taken_off() -> None:
+def pairs_of_a_lag(lag: float, spread: float = 1.0) -> Any:
     rng = np.random.default_rng(11)
-    slowness = rng.uniform(1.0, 20.0, 2000)
-    middle = 50.0 + 0.3 * slowness + rng.normal(0.0, 1.0, slowness.size)
-    mode = weighted_mode(middle, np.ones(middle.size), 2.0)
-    assert mode.at > 51.0
-    corrected, lag = without_lag(middle, np.ones(middle.size), slowness, mode, 2.0)
-    assert corrected.at == pytest.approx(50.0, abs=4.0 * corrected.sigma)
-    assert lag.at == pytest.approx(0.3, abs=0.05)
-    assert lag.sigma < 0.02
+    slowness = rng.uniform(1.0, 20.0, 4000)
+    middle = 50.0 + lag * slowness + rng.normal(0.0, spread, slowness.size)
+    return middle, np.ones(middle.size), slowness, float(np.median(middle)), 2.0
 
 
-def test_without_a_lag_nothing_is_taken_off() -> None:
-    rng = np.random.default_rng(12)
-    slowness = rng.uniform(1.0, 20.0, 500)
-    middle = 50.0 - 0.02 * slowness + rng.normal(0.0, 1.0, slowness.size)
-    mode = weighted_mode(middle, np.ones(middle.size), 2.0)
-    corrected, lag = without_lag(middle, np.ones(middle.size), slowness, mode, 2.0)
-    assert lag.at == pytest.approx(0.0, abs=0.01)
-    assert corrected.at == pytest.approx(49.8, abs=0.3)
+def test_the_lag_of_dark_pixels_is_measured() -> None:
+    line = line_of_classes(*pairs_of_a_lag(0.15))
+    assert line is not None
+    assert line.slope == pytest.approx(0.15, abs=3.0 * line.sigma)
+    lag = expected_lag(line, mean=1.0)
+    assert lag.at == pytest.approx(line.slope, abs=0.01)
+    assert lag.sigma == pytest.approx(line.sigma, rel=0.1)
+
+
+def test_a_lag_is_never_negative_and_unmeasured_is_what_may_be_expected() -> None:
+    line = line_of_classes(*pairs_of_a_lag(-0.1))
+    assert line is not None
+    assert line.slope < 0.0
+    assert 0.0 <= expected_lag(line, mean=1.0).at < line.sigma
+    assert expected_lag(None, mean=0.7) == Lag(0.7, 0.7)
+    assert expected_lag(None, mean=0.0) == Lag()
+    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
+    assert line_of_classes(middle, weights, np.ones_like(slowness), mode, width) is None
+    assert line_of_classes(middle[:20], weights[:20], slowness[:20], mode, width) is None
+
+
+def test_the_slowness_that_explains_the_pairs_has_the_say() -> None:
+    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
+    shuffled = np.random.default_rng(3).permutation(slowness)
+    lines = [line_of_classes(middle, weights, one, mode, width) for one in (slowness, shuffled)]
+    share = weights_of_lines(lines)
+    assert share[0] > 0.7
+    assert weights_of_lines([None, None]).tolist() == [0.5, 0.5]
+    both = average_lag([Lag(1.0, 0.1), Lag(3.0, 0.1)], np.array([1.0, 1.0]))
+    assert both.at == pytest.approx(2.0)
+    assert both.sigma == pytest.approx(1.0, abs=0.01)
+
+
+def test_white_noise_has_no_energy_in_any_band() -> None:
+    rng = np.random.default_rng(2)
+    weight = np.ones((128, 128), np.float32)
+    noise = rng.standard_normal((128, 128)).astype(np.float32)
+    waves = np.cos(2.0 * np.pi * np.arange(128) / 8.0).astype(np.float32)[None, :] * weight
+    alone, with_noise = (band_energies(one.astype(np.float32), weight) for one in (waves, waves + noise))
+    np.testing.assert_allclose(with_noise, alone, atol=0.02)
+    assert (band_energies(noise, weight) < 0.01).all()
+
+
+def bands(departure: float, coarse: float = 0.0) -> Any:
+    """Log S of a lens whose finest band is best *departure* beyond focus, at 2, and coarser bands in proportion."""
+    z = np.linspace(-60.0, 60.0, 61)
+    curves = [
+        -((z - 2.0 - departure * (BANDS_PX[0] / scale) ** 2 - (coarse if scale > 2.0 else 0.0)) ** 2)
+        / (2.0 * (80.0 * (1.0 + 0.2 * k)) ** 2)
+        for k, scale in enumerate(BANDS_PX)
+    ]
+    return z, np.stack(curves, axis=1)
+
+
+def test_focus_is_where_the_coarsest_bands_would_be_sharpest() -> None:
+    found = focus_of_bands(*bands(0.0), 50.0)
+    assert found.at == pytest.approx(2.0, abs=0.05)
+    found = focus_of_bands(*bands(-5.0), 50.0)
+    assert found.finest.at == pytest.approx(-3.0, abs=0.05)
+    assert found.at == pytest.approx(2.0, abs=1.5)
+    assert abs(found.at - 2.0) < 2.0 * found.sigma
+
+
+def test_a_coarse_band_without_structure_is_not_asked() -> None:
+    found = focus_of_bands(*bands(0.0, coarse=40.0), 50.0)
+    assert found.at == pytest.approx(2.0, abs=0.3)
+
+
+def test_candidates_are_averaged_by_how_well_they_are_parabolas() -> None:
+    vertex = Vertex(0.0, 0.5, 80.0, 5)
+    good, poor = BandFocus(1.0, 0.5, vertex, 0.0, 0.1), BandFocus(9.0, 0.5, vertex, 0.0, 0.3)
+    assert average_focus([good, poor]).at == pytest.approx(1.0, abs=0.01)
+    split = average_focus([good, BandFocus(3.0, 0.5, vertex, 0.0, 0.1)])
+    assert split.at == pytest.approx(2.0)
+    assert split.sigma > 1.0
 
 
 def drawn(values: Any) -> Any:
     track = PeakTrack()
     for k, value in enumerate(values):
-        track.add(1000 * k, float(k), float(value))
+        track.add_bands(1000 * k, float(k), np.full(len(BANDS_PX), float(value)))
     return track
 
 
@@ -165,7 +222,7 @@ def test_a_peak_is_passed_when_the_curve_has_risen_and_fallen() -> None:
     assert not drawn(curve[:44]).passed
     track = drawn(curve[:55])
     assert track.passed
-    assert track.vertex().at == pytest.approx(40.0)
+    assert track.focus().at == pytest.approx(40.0)
 
 
 def test_a_curve_that_only_falls_or_only_rises_has_not_peaked() -> None:
@@ -177,5 +234,5 @@ def test_a_curve_that_only_falls_or_only_rises_has_not_peaked() -> None:
 def test_a_falling_position_gives_the_same_vertex() -> None:
     track = PeakTrack()
     for k in range(60):
-        track.add(1000 * k, 100.0 - k, -((k - 40.0) ** 2) / 200.0)
-    assert track.vertex().at == pytest.approx(60.0)
+        track.add_bands(1000 * k, 100.0 - k, np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0))
+    assert track.focus().at == pytest.approx(60.0)

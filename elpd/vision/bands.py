@@ -1,0 +1,165 @@
+"""The sharpness of an image in several bands of spatial frequency, and the one focus behind them.
+
+Two things are the matter with a single band. *Noise*: what is wrong with a pixel's value independently of its
+neighbours' (threshold mismatch, what a pixel holds back, refractory losses, a frame's read-out) adds to the energy, and
+what grows with time moves the peak. Such noise is white, so the band next to the sampling limit, where a lens leaves
+hardly any picture, measures it, and its share in every other band is known from the kernels alone: it is subtracted.
+Nothing need be known of the sensor, and whatever picture there is in that band turns in focus like the rest.
+
+*Aberration*: off the axis a lens is sharpest at different positions for different spatial frequencies. For low ones the
+transfer function is ``1 - 2π²f²·σ²``, with σ the RMS radius of the point spread function, so their peak is where that
+radius is least: the definition of focus that needs no picture, and the one used here. Finer bands depart from it in
+proportion to f², but they have the steeper curves. So the bands' vertices are fitted as ``focus + departure·f²``, each
+with its own error; where the coarse bands know little, the departure is bounded by what lenses show (``DEPARTURE``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+DEPARTURE = 0.04
+"""Standard deviation, in widths of the curve, of how far the finest band's focus lies from the least RMS radius: the
+fields of a traced F/2 lens have 0 to 0.12, mostly little."""
+
+LEAST_SIGMA = 0.005
+"""Standard error of a vertex at the least, in widths: curves of log S are parabolas near their top only."""
+
+UNEXPLAINED = 0.4
+"""Share of the departure that may be wrong: transfer functions have terms beyond f²."""
+
+_FREQUENCIES = np.array([(BANDS_PX[0] / scale_px) ** 2 for scale_px in BANDS_PX])
+_CORNER = (np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0).astype(np.float32)
+_GAINS = np.array([band_gain(scale_px) for scale_px in BANDS_PX])
+_FLOOR = 1e-3
+_SURPRISE = 3.0
+_FREEDOM = 8
+"""How many independent points a curve has, about: neighbours share most of what is wrong with them."""
+
+
+def band_energies(image: NDArray[np.float32], weight: NDArray[np.float32], margin: int = 0) -> NDArray[np.float64]:
+    """Return the weighted mean square of each band of *image*, (bands,), freed of white noise.
+
+    *margin* pixels at each side are left out of the mean; of a small image less is: at least its middle eight pixels
+    are measured.
+    """
+    return freed_of_noise(band_products(image, image, weight, margin))
+
+
+def band_products(
+    one: NDArray[np.float32], other: NDArray[np.float32], weight: NDArray[np.float32], margin: int = 0
+) -> NDArray[np.float64]:
+    """Return the weighted mean product of each band of two images, and last that of the band of noise: (bands + 1,)."""
+    middle = inside(one.shape, margin)
+    first = _filtered(one, middle)
+    second = first if other is one else _filtered(other, middle)
+    return np.array(
+        [float((a * b * weight[middle]).mean(dtype=np.float64)) for a, b in zip(first, second, strict=True)]
+    )
+
+
+def inside(shape: tuple[int, ...], margin: int) -> tuple[slice, slice]:
+    """Return what is left of an image without its margins: of a small one, at least the middle eight pixels."""
+    margin = max(0, min(margin, (min(shape) - 8) // 2))
+    middle = slice(margin, -margin or None)
+    return middle, middle
+
+
+def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Subtract white noise from energies (..., bands + 1), the last of which measures it: (..., bands)."""
+    raw = energies[..., :-1]
+    return np.asarray(np.maximum(raw - _GAINS * energies[..., -1:], _FLOOR * raw))
+
+
+def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
+    bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
+    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, _CORNER), dtype=np.float32)[middle]]
+
+
+@dataclass(frozen=True, slots=True)
+class BandFocus:
+    """Where focus is, with its error; the finest band's vertex; how far it departs from focus.
+
+    ``scatter`` is how far the points of the two finest bands lie off their parabolas, as an error of the vertex.
+    """
+
+    at: float
+    sigma: float
+    finest: Vertex
+    departure: float
+    scatter: float
+
+    def mirrored(self, sign: float) -> BandFocus:
+        """Return the same on a ruler that runs the other way, where *sign* is -1."""
+        finest = replace(self.finest, at=sign * self.finest.at)
+        return BandFocus(sign * self.at, self.sigma, finest, sign * self.departure, self.scatter)
+
+
+def focus_of_bands(
+    position: NDArray[np.float64], log_energies: NDArray[np.float64], half_width: float
+) -> BandFocus | None:
+    """Fit each band's parabola, (points, bands), and the focus behind them; ``None`` if the finest has no peak."""
+    raw = [fit_vertex(position, log_energies[:, band], half_width) for band in range(len(BANDS_PX))]
+    finest = _with_window(raw[0], position, log_energies[:, 0], half_width)
+    if raw[0] is None or finest is None:
+        return None
+    scatter = float(np.hypot(raw[0].sigma, raw[0].sigma if raw[1] is None else raw[1].sigma))
+    bound = DEPARTURE * finest.width
+    normal, right, squares, count = np.diag([0.0, 1.0 / bound**2]), np.zeros(2), 0.0, 0
+    for band, f_squared in enumerate(_FREQUENCIES):
+        vertex = _with_window(raw[band], position, log_energies[:, band], half_width)
+        row = np.array([1.0, f_squared])
+        if vertex is None:
+            break
+        # Structure that moves in and out of view tilts log S, and a tilt moves a vertex by the square of its width;
+        # and there is the less structure to average over, the coarser the band.
+        sigma = max(vertex.sigma, LEAST_SIGMA * finest.width) * (vertex.width / finest.width) ** 3
+        if band > 0:
+            # What the finer bands and the bound on the departure leave to expect here. A picture that has little
+            # structure so coarse shows its drift instead, and does so in all bands coarser still.
+            inverse = np.linalg.inv(normal)
+            surprise = vertex.at - float(row @ inverse @ right)
+            variance = float(row @ inverse @ row) + sigma**2
+            if surprise**2 > _SURPRISE**2 * variance:
+                break
+            squares += surprise**2 / variance
+        normal += np.outer(row, row) / sigma**2
+        right += row * vertex.at / sigma**2
+        count += 1
+    inverse = np.linalg.inv(normal)
+    focus, departure = (float(one) for one in inverse @ right)
+    own = float(np.sqrt(inverse[0, 0] * max(1.0, squares / count)))
+    return BandFocus(focus, float(np.hypot(own, UNEXPLAINED * departure)), finest, departure, scatter)
+
+
+def average_focus(candidates: Sequence[BandFocus]) -> BandFocus:
+    """Average what candidate curves say by how well each is a parabola; their disagreement counts as error."""
+    scatter = np.array([max(one.scatter, 1e-6 * one.finest.width) for one in candidates])
+    weights = (scatter.min() / scatter) ** _FREEDOM
+    weights /= weights.sum()
+    at = np.array([one.at for one in candidates])
+    focus = float(weights @ at)
+    best = candidates[int(np.argmax(weights))]
+    sigma = float(np.sqrt(weights @ (np.array([one.sigma for one in candidates]) ** 2 + (at - focus) ** 2)))
+    return replace(best, at=focus, sigma=sigma)
+
+
+def _with_window(
+    vertex: Vertex | None, position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float
+) -> Vertex | None:
+    """Add to a vertex' error how it moves with the window, which tells more than the scatter of neighbours."""
+    if vertex is None:
+        return None
+    narrow = fit_vertex(position, log_energy, 0.7 * half_width)
+    moved = 0.5 * half_width if narrow is None else abs(narrow.at - vertex.at)
+    return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))

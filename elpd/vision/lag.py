@@ -1,0 +1,171 @@
+"""How late a photoreceptor is, and what that does to the place of focus.
+
+A photoreceptor follows its light with a time constant in inverse proportion to it, so dark pixels see focus later than
+bright ones, by the lens's speed times that constant: micrometres in a dim room. The mirror pairs of dark and of bright
+pixels tell: their midpoints are put in classes of equal weight by slowness, a class's midpoint is its robust mean, and
+a line through the classes has the lag for its slope. Whatever else makes one part of a picture differ from another
+(aberration, motion) shows in how the classes scatter about that line, so the error is taken from there and not from the
+thousands of pairs. A scene of one brightness tells nothing; then what is known of photoreceptors in general has the
+say: a lag is never negative, and longer ones are rarer, so the expectation before any measurement is an exponential.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import erfc, exp, inf, pi, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from elpd.records import SensorProfile
+
+UNMEASURED_LAG_US = 1_000.0
+"""What a typical pixel's lag is expected to be when nothing tells: a tenth of it in sunlight, tenfold in the dark."""
+
+OTHER_LIGHT = 0.5
+"""How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
+
+CLASSES = 10
+FEWEST_CLASSES = 5
+FEWEST_IN_CLASS = 10
+NEIGHBOURS = 2.0
+"""Classes next to each other share parts of the scene: so many count as one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """How far the lens went while the brightest photoreceptors answered, and one standard error.
+
+    A pixel ``s`` times slower than the brightest is late by ``s`` times this. Where no brightness is known, all pixels
+    count as equally slow.
+    """
+
+    at: float = 0.0
+    sigma: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LagPrior:
+    """What a calibration says of ``Lag.at``, and its standard error."""
+
+    at: float
+    sigma: float
+
+    @classmethod
+    def of(cls, sensor: SensorProfile | None, speed_um_us: float) -> LagPrior | None:
+        """Return how far a lens goes, at a speed, during a calibrated lag; ``None`` without one."""
+        if sensor is None or sensor.lag_us is None or sensor.lag_sigma_us is None or speed_um_us <= 0.0:
+            return None
+        sigma_us = max(1.0, sqrt(sensor.lag_sigma_us**2 + (OTHER_LIGHT * sensor.lag_us) ** 2))
+        return cls(sensor.lag_us * speed_um_us, sigma_us * speed_um_us)
+
+    def with_line(self, measured: Line | None) -> Lag:
+        """Average what the pairs' classes say and what the calibration does, by their errors; not below zero."""
+        if measured is None or not measured.sigma > 0.0:
+            return Lag(self.at, self.sigma)
+        precision, prior = measured.sigma**-2, self.sigma**-2
+        at = (precision * measured.slope + prior * self.at) / (precision + prior)
+        return Lag(max(0.0, at), 1.0 / sqrt(precision + prior))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A slope and its standard error, the scatter of the points about the line, and how many they are."""
+
+    slope: float
+    sigma: float
+    scatter: float
+    points: int
+
+
+def line_of_classes(
+    middle: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    slowness: NDArray[np.float64],
+    mode: float,
+    width: float,
+) -> Line | None:
+    """Return the line of pairs' midpoints against slowness; ``None`` if there is none.
+
+    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say.
+    """
+    order = np.argsort(slowness, kind="stable")
+    order = order[np.abs(middle[order] - mode) <= 3.0 * width]
+    summed = np.cumsum(weights[order])
+    if order.size < FEWEST_IN_CLASS * FEWEST_CLASSES or summed[-1] <= 0.0:
+        return None
+    cuts = np.searchsorted(summed, summed[-1] * np.arange(1, CLASSES) / CLASSES)
+    slow, late = [], []
+    for part in np.split(order, cuts):
+        if part.size >= FEWEST_IN_CLASS:
+            slow.append(float(np.average(slowness[part], weights=weights[part])))
+            late.append(_robust_mean(middle[part], weights[part], 3.0 * width))
+    if len(slow) < FEWEST_CLASSES or np.ptp(slow) <= 1e-9 * max(slow):
+        return None
+    x, y = np.array(slow) - np.mean(slow), np.array(late) - np.mean(late)
+    slope = float(x @ y / (x @ x))
+    variance = float(np.square(y - slope * x).sum()) / (x.size - 2)
+    return Line(slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24)), sqrt(variance), x.size)
+
+
+def expected_lag(line: Line | None, mean: float) -> Lag:
+    """Return the mean and standard deviation of what is known after a measurement.
+
+    Before it, the lag has the exponential distribution of mean *mean*; a normal error on top leaves a normal
+    distribution cut off at zero.
+    """
+    if mean <= 0.0:
+        return Lag()
+    if line is None or line.sigma > 1e3 * mean:
+        return Lag(mean, mean)
+    sigma = line.sigma
+    shifted = line.slope - sigma * sigma / mean
+    cut = -shifted / sigma
+    # Mills' ratio; far out, where the normal's tail underflows, its own expansion.
+    hazard = (
+        cut + 1.0 / cut - 2.0 / cut**3 if cut > 20.0 else sqrt(2.0 / pi) * exp(-0.5 * cut * cut) / erfc(cut / sqrt(2.0))
+    )
+    at = shifted + sigma * hazard
+    variance = sigma * sigma * (1.0 + cut * hazard - hazard * hazard)
+    return Lag(max(at, 0.0), sqrt(variance) if variance > 0.0 else max(at, 0.0))
+
+
+def weights_of_lines(lines: Sequence[Line | None]) -> NDArray[np.float64]:
+    """Return how well each of several lines explains the same midpoints, as weights of sum one."""
+    known = [one.scatter for one in lines if one is not None]
+    if not known:
+        return np.full(len(lines), 1.0 / len(lines))
+    least = max(min(known), 1e-12)
+    likelihood = [
+        0.0 if one is None else (least / max(one.scatter, least)) ** (one.points / NEIGHBOURS) for one in lines
+    ]
+    return np.array(likelihood) / sum(likelihood)
+
+
+def average_lag(lags: Sequence[Lag], weights: NDArray[np.float64]) -> Lag:
+    """Average lags by *weights*; the error holds how far the largest of them lies, which may be the right one.
+
+    Answers that are too late by a lag that was underrated all err to one side, and nothing else tells of it.
+    """
+    at, sigma = np.array([one.at for one in lags]), np.array([one.sigma for one in lags])
+    share = weights / weights.sum()
+    mean = float(share @ at)
+    return Lag(mean, float(np.sqrt(share @ sigma**2 + (at.max() - mean) ** 2)))
+
+
+def _robust_mean(values: NDArray[np.float64], weights: NDArray[np.float64], reach: float) -> float:
+    """Return the weighted mean under Tukey's biweight."""
+    at, before = float(np.average(values, weights=weights)), inf
+    for _ in range(30):
+        if abs(at - before) <= 1e-6 * reach:
+            break
+        kept = weights * np.square(np.maximum(0.0, 1.0 - np.square((values - at) / reach)))
+        if kept.sum() <= 0.0:
+            break
+        at, before = float(np.average(values, weights=kept)), at
+    return at
