@@ -90,6 +90,10 @@ def bench(made: Rig, repeats: int = 2) -> LensBench:
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "avr"])  # its firmware is emulated: minutes
 def test_a_measured_stop_is_the_next_one_that_comes(kind: str) -> None:
     made = open_rig(kind)
+    if not made.lens.capabilities.stop_on_command:
+        with pytest.raises(UsageError, match="cannot stop on command"):
+            bench(made).measure(homing=False)
+        return
     stopping = measure_lens(bench(made).measure(homing=False))
     timings = stopping.timings()
     assert isinstance(made.lens, LearnsStops)
