@@ -114,6 +114,9 @@ def main() -> int:
         if hindrance is not None:
             print(f"{board}: left out, {hindrance}", file=sys.stderr)
             continue
+        if not made(board, 0, 1250.0)[2].capabilities.stop_on_command:
+            print(f"{board}: left out, it cannot stop on command", file=sys.stderr)
+            continue
         measured = calibrated(board) if chosen.calibrated else {}
         runs, faults = [], []
         for seed in range(chosen.first, chosen.first + chosen.seeds):
