@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         PositionEstimate,
         Roi,
         StopMode,
+        StopTiming,
     )
     from elpd.scale import LensScale
     from elpd.units import HostNs, Steps
@@ -204,11 +205,20 @@ class Latency(Protocol):
 
 @runtime_checkable
 class Identified(Protocol):
-    """A camera that knows which one of its kind it is."""
+    """A camera or a lens that knows which one of its kind it is."""
 
     @property
     def serial(self) -> str:
         """The serial number."""
+        ...
+
+
+@runtime_checkable
+class LearnsStops(Protocol):
+    """A lens whose driver takes what was measured of its stops in place of what it assumes."""
+
+    def learn_stops(self, measured: Mapping[StopMode, StopTiming]) -> None:
+        """Model stops by *measured* from now on; modes that are not in it stay as they are."""
         ...
 
 

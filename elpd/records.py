@@ -166,6 +166,8 @@ class LensCapabilities:
 
     ``stop_onset_ms`` is the time from the stop byte to the first slower step (a calibrated number, GRBL: 45 ms), and
     ``stop_onset_sigma_ms`` how well it is known. ``watchdog_ms`` is the controller's own dead-man, where it has one.
+    ``stop_deceleration_sps2`` is how hard it brakes, with its standard error, where that was measured: else a ramp
+    brakes by the limits' acceleration, and an abrupt stop has no ramp.
     """
 
     native_velocity: bool
@@ -175,6 +177,23 @@ class LensCapabilities:
     stop_onset_ms: float
     stop_onset_sigma_ms: float
     watchdog_ms: float | None = None
+    stop_deceleration_sps2: float | None = None
+    stop_deceleration_sigma_sps2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StopTiming:
+    """How a controller was measured to stop.
+
+    ``onset_ms`` is the time from the stop's bytes being handed to the port to the first slower step, ``onset_sigma_ms``
+    its standard deviation from one stop to the next, its own error included. ``deceleration_sps2`` is ``None`` where
+    there is no ramp, or it is the one that the controller is set to.
+    """
+
+    onset_ms: float
+    onset_sigma_ms: float
+    deceleration_sps2: float | None = None
+    deceleration_sigma_sps2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 from elpd.calibrate.aperture import with_profile
+from elpd.calibrate.in_use import as_measured
+from elpd.calibrate.lens import teach
 from elpd.errors import ConfigError, DeviceError
 from elpd.motion.lens_output import aperture_on_lens
 from elpd.ports import Closeable, RigParts
@@ -55,10 +57,11 @@ def find(group: str, name: str) -> Any:
 
 
 def build(config: Config) -> RigParts:
-    """Build the rig that *config* describes. Nothing moves yet.
+    """Build the rig that *config* describes, and what profiles know of its lens. Nothing moves yet.
 
     Raises ``ConfigError`` for unknown drivers and keys, ``DeviceError`` for devices that do not answer.
     """
+    config = as_measured(config)
     if config.rig == "sim":
         parts: RigParts = find("elpd.rigs", "sim")(
             {
@@ -71,6 +74,7 @@ def build(config: Config) -> RigParts:
         parts = _hardware(config)
     if config.rig == "sim":
         parts = _with_replacements(parts, config)
+    teach(parts.lens, config)
     return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
@@ -90,9 +94,11 @@ def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
         return
     if config.lens.driver == "sim":
         raise ConfigError('lens.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    config = as_measured(config)
     clock = MonotonicClock()
     lens = _open_lens(config.lens, clock)
     try:
+        teach(lens, config)
         yield clock, lens, _scale(config.lens)
     finally:
         if isinstance(lens, Closeable):

@@ -114,13 +114,26 @@ class Capture:
             stage.listener = None
         missing = {}
         if stage.lost_events > lost:
-            missing["sweeps"] = missing["steps"] = (
-                f"{stage.lost_events - lost} events were lost on the way from the camera; close what else uses the "
-                "machine, or aim at less texture"
-            )
+            missing["sweeps"] = missing["steps"] = _lost_on_the_way(stage.lost_events - lost)
             sweeps, steps = (), ()
         geometry = stage.parts.camera.geometry
         return Evidence(geometry, rest, sweeps, steps, brightness, doubt, black, None, stage.lost_events, missing)
+
+    def sweeps_alone(self) -> Evidence:
+        """Take the there-and-backs only. Raises as ``take`` does."""
+        self._find_room()
+        stage = self._stage
+        self._settle()
+        stage.listener = self._keep
+        try:
+            lost = stage.lost_events
+            sweeps = tuple(self._sweeps(share * self._speed_um_s) for share in SHARES_OF_SPEED)
+        finally:
+            stage.listener = None
+        missing = {}
+        if stage.lost_events > lost:
+            sweeps, missing = (), {"sweeps": _lost_on_the_way(stage.lost_events - lost)}
+        return Evidence(stage.parts.camera.geometry, None, sweeps, lost_events=stage.lost_events, missing=missing)
 
     def rest_alone(self, rest_s: float, missing: dict[str, str]) -> Evidence:
         """Take what can be had without moving the lens. Raises ``DeviceError`` from the rig."""
@@ -245,3 +258,10 @@ class Capture:
             every = every.chosen(np.argsort(every.t_us, kind="stable"))
         self._drop()
         return every.between(begin_us, end_us)
+
+
+def _lost_on_the_way(events: int) -> str:
+    return (
+        f"{events} events were lost on the way from the camera; close what else uses the machine, "
+        "or aim at less texture"
+    )

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from elpd.calibrate.level_pairs import level_pairs
 from elpd.calibrate.quantity import Quantity
 from elpd.vision.pairs import Pairs, find_pairs, weighted_mode
 
@@ -118,7 +119,7 @@ def measure_lag(
     found = []
     for sweep in sorted(sweeps, key=lambda one: one.speed_um_s)[:2]:
         for one in sweep.passes:
-            pairs = _pairs(sweep, one, good, geometry, depth_of_focus_um)
+            pairs = focus_pairs(sweep, one, good, geometry, depth_of_focus_um)
             if pairs is not None:
                 found.append(_crossings(pairs, one, sweep, brightness))
     speeds = {round(abs(float(one.velocity.mean()))) for one in found if one.middle.size}
@@ -133,17 +134,29 @@ def _none(reason: str) -> Lag:
     return Lag(Quantity.none(reason, "us"), Quantity.none(reason, "us"), ())
 
 
-def _pairs(
-    sweep: Sweeps, one: Pass, good: NDArray[np.bool_], geometry: Geometry, depth_of_focus_um: float
+def focus_pairs(
+    sweep: Sweeps,
+    one: Pass,
+    good: NDArray[np.bool_],
+    geometry: Geometry,
+    depth_of_focus_um: float,
+    ratio: float | None = None,
 ) -> tuple[Pairs, NDArray[np.float64]] | None:
-    """Return the pairs around focus of one pass, with weights; ``None`` if focus was not passed at a steady speed."""
+    """Return the pairs around focus of one pass, with weights; ``None`` if focus was not passed at a steady speed.
+
+    Positions are the ruler's times the pass's sign, so that they rise. *good* is (height, width). With *ratio*, C_on
+    over C_off, the halves of a pair are at equal light where thresholds differ too.
+    """
     events = sweep.events.between(one.begin_us, one.end_us)
     t_us, x, y, on = events.chosen(good[events.y, events.x])
     if t_us.size < FEWEST_PAIRS:
         return None
     shape = (geometry.height, geometry.width)
     position = sweep.path.at(t_us)
-    pairs = find_pairs(t_us, x, y, on, one.sign * position, shape)
+    if ratio is None:
+        pairs = find_pairs(t_us, x, y, on, one.sign * position, shape)
+    else:
+        pairs = level_pairs(t_us, x, y, on, one.sign * position, ratio)
     if pairs.on.size < FEWEST_PAIRS:
         return None
     gap = np.maximum(pairs.after - pairs.before, 0.02 * depth_of_focus_um)
@@ -152,9 +165,9 @@ def _pairs(
         return None
     # What the events have drawn when focus is passed tells peaks from troughs, and so which turns are focus.
     until = int(np.searchsorted(one.sign * position, rough.at))
-    level = np.zeros(shape, np.int32)
-    np.add.at(level, (y[:until], x[:until]), 2 * on[:until].astype(np.int32) - 1)
-    smooth = cv2.GaussianBlur(level.astype(np.float32), (0, 0), 1.0)
+    level = np.zeros(shape, np.float32)
+    np.add.at(level, (y[:until], x[:until]), np.where(on[:until] == 1, ratio or 1.0, -1.0).astype(np.float32))
+    smooth = cv2.GaussianBlur(level, (0, 0), 1.0)
     curvature = cv2.Laplacian(smooth, cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     believed = (2.0 * pairs.on - 1.0) * curvature > 0.0
     weight = np.where(believed, np.abs(curvature) / gap, 0.0)

@@ -10,8 +10,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from elpd.calibrate.capture import Capture
+from elpd.calibrate.evidence import Evidence
 from elpd.focus.cycle import FocusCycle
-from elpd.focus.expose import expose
+from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
 from elpd.focus.settings import FocusRequest
 from elpd.focus.stage import REST_LIMIT_MS, Stage
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from elpd.calibrate.evidence import Evidence
     from elpd.focus.settings import CycleSettings
     from elpd.ports import RigParts
 
@@ -55,6 +55,7 @@ def take_evidence(
     reach_um: float,
     here: bool,
     black: float | None = None,
+    sweeps_alone: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Evidence:
     """Focus, and collect everything that a sensor's calibration looks at.
@@ -69,6 +70,8 @@ def take_evidence(
         Do not focus first: the lens stands in focus already.
     black:
         Grey level of darkness in this camera's frames, where it is known.
+    sweeps_alone:
+        Neither rest nor pictures: what the lens's play takes. Without focus there is nothing to take then.
 
     Raises
     ------
@@ -98,6 +101,13 @@ def take_evidence(
                 reach_um=reach_um,
                 progress=progress,
             )
+            if sweeps_alone:
+                if why is not None:
+                    return Evidence(parts.camera.geometry, missing={"sweeps": why})
+                if here and parts.aperture is not None:
+                    parts.aperture.open()
+                    stage.wait_ms(AFTER_FACTOR * parts.aperture.opening_ms)
+                return capture.sweeps_alone()
             if why is not None:
                 return capture.rest_alone(rest_s, {"sweeps": why, "steps": why})
             doubt = DOUBT_OF_FRAME if parts.aperture is None else DOUBT_OF_MAP

@@ -15,7 +15,7 @@ import json
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -27,21 +27,26 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from elpd.config import Config
-    from elpd.ports import EventCamera
+    from elpd.ports import EventCamera, Lens
 
+_SIMULATED_LENS = ("board", "travel_um", "backlash_um", "acceleration_um_s2", "microstep_error_um", "cam")
 _SIMULATED_SENSOR = ("seed", "camera", "width", "height", "noise_hz", "leak_hz", "hot_pixels", "hot_pixel_hz",
                      "contrast_on", "contrast_off", "refractory_us", "mismatch", "lag_us", "brightness")  # fmt: skip
 
 
 class MeasuredOn(BaseModel):
-    """The device that a profile is about. ``settings`` are the config keys that change what it does."""
+    """The device that a profile is about. ``settings`` are the config keys that change what it does.
+
+    ``width`` and ``height`` are a camera's pixels; a lens has none.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    part: Literal["camera", "lens"] = "camera"
     device: str
     serial: str | None
-    width: int
-    height: int
+    width: int = 0
+    height: int = 0
     settings: dict[str, Any]
 
     @classmethod
@@ -60,17 +65,40 @@ class MeasuredOn(BaseModel):
         plain = json.loads(json.dumps(dict(settings), default=str))
         return cls(device=device, serial=serial, width=geometry.width, height=geometry.height, settings=plain)
 
+    @classmethod
+    def lens(cls, config: Config, lens: Lens | None = None, *, ruler: bool = False) -> MeasuredOn:
+        """Describe the lens of a configured rig; *ruler* adds its table of steps, for what was measured in um by it.
+
+        Without the open *lens* its serial number is not known, and not compared.
+        """
+        section = config.lens
+        device = section.driver
+        if config.rig == "sim" and device == "sim":
+            every = config.sim.model_dump(mode="json")
+            settings: dict[str, Any] = {f"sim.{key}": every[key] for key in _SIMULATED_LENS if key in every}
+            device = f"sim {config.sim.board}"
+        else:
+            settings = {f"lens.{key}": value for key, value in section.settings().items()}
+        settings["lens.um_per_step"] = section.um_per_step
+        if ruler and section.steps_to_um:
+            settings["lens.steps_to_um"] = section.steps_to_um
+        serial = lens.serial if isinstance(lens, Identified) else None
+        return cls(part="lens", device=device, serial=serial, settings=json.loads(json.dumps(settings, default=str)))
+
     def difference(self, other: MeasuredOn) -> str | None:
         """Say in what *other* is another device or otherwise set; ``None`` if it is the same."""
         if (self.width, self.height) != (other.width, other.height):
             return f"it was measured on {self.width}x{self.height} pixels, this camera has {other.width}x{other.height}"
-        for name, before, now in (("camera", self.device, other.device), ("serial number", self.serial, other.serial)):
+        pairs: list[tuple[str, str | None, str | None]] = [(self.part, self.device, other.device)]
+        if self.part == "camera" or (self.serial is not None and other.serial is not None):
+            pairs.append(("serial number", self.serial, other.serial))
+        for name, before, now in pairs:
             if before != now:
                 return f"it was measured on the {name} {before}, this one is {now}"
         for key in sorted({*self.settings, *other.settings}):
-            before, now = self.settings.get(key), other.settings.get(key)
-            if before != now:
-                return f"it was measured with {key} = {before}, which is {now} now"
+            then, today = self.settings.get(key), other.settings.get(key)
+            if then != today:
+                return f"it was measured with {key} = {then}, which is {today} now"
         return None
 
 

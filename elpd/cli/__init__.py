@@ -19,7 +19,7 @@ from elpd.cli.common import report_error
 from elpd.errors import ElpdError
 
 COMMANDS = {
-    "calibrate": "measure the rig itself: sensor",
+    "calibrate": "measure the rig itself: aperture, backlash, lens, sensor",
     "check": "what is installed, what is plugged in, and does it work",
     "decode": "what an event file holds",
     "demo": "focus the embedded simulated rig, live in the terminal",

@@ -10,6 +10,8 @@ from elpd.cli import LazyGroup
 
 KINDS = {
     "aperture": "transmittance against time of an opening aperture, and its delay",
+    "backlash": "the play between motor and glass, by focus passed in both directions",
+    "lens": "how the lens stops, how its replies travel, whether it loses steps; or a table of steps and um",
     "sensor": "noise, hot pixels, thresholds, refractory period and photoreceptor lag of the camera",
 }
 

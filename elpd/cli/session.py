@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import structlog
 
 from elpd import rig
+from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.sensor import sensor_in_use
 from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
@@ -73,6 +74,7 @@ def focus_on(
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Session:
     """Run one whole cycle on a rig that stays the caller's; raises what ``focus_once`` raises."""
+    config = as_measured(config)  # what is recorded with the run is what was in force
     if request.reference is not None and request.reference.suffix == ".npz":
         here_um = parts.scale.to_um(parts.lens.position_at(parts.clock.now_ns()).steps)
         depth_of_focus_um = CycleSettings.from_config(config).depth_of_focus_um

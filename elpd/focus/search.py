@@ -9,6 +9,7 @@ from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR
 from elpd.focus.stage import REST_LIMIT_MS
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
+from elpd.motion.braking import braking_from
 from elpd.records import Outcome, Phase, StopMode
 from elpd.units import NS_PER_S, HostNs
 
@@ -92,12 +93,13 @@ class Search:
         watch = self._watch
         capabilities, limits = self._lens.capabilities, self._lens.limits
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
-        braking_um = self._braking_um(speed_um_s)
+        braking = braking_from(speed_um_s, capabilities, limits, self._stage.um_per_step)
+        braking_um = braking.longest_um
         turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0
         if not capabilities.native_velocity:
             turn_s += REJOG_S
-        slow = braking_um > 5 * self._settings.depth_of_focus_um
-        self.strategy = "sweep_and_return" if slow else "stop_on_detect"
+        at_once = braking.stops_on_detect(self._settings.depth_of_focus_um)
+        self.strategy = "stop_on_detect" if at_once else "sweep_and_return"
         sweep = Sweep(self._stage, watch, cancelled=self._cancelled, observe=self._observe)
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
@@ -185,12 +187,3 @@ class Search:
         limits = self._lens.limits
         here = self._lens.position_at(self._stage.now_ns()).steps
         return 1 if limits.max_steps - here >= here - limits.min_steps else -1
-
-    def _braking_um(self, speed_um_s: float) -> float:
-        """Return the way from the stop command to rest."""
-        capabilities, limits = self._lens.capabilities, self._lens.limits
-        onset_ms = capabilities.stop_onset_ms + 2 * capabilities.stop_onset_sigma_ms
-        ramp_um = 0.0
-        if not capabilities.abrupt_stop:
-            ramp_um = speed_um_s**2 / (2 * limits.acceleration_sps2 * self._stage.um_per_step)
-        return speed_um_s * onset_ms / 1000.0 + ramp_um

@@ -27,6 +27,9 @@ POLL_MS = 2.0
 SPARE_MS = 1000.0
 """Beyond what the way and the speed explain, a lens may take this much longer to be at rest."""
 
+REPORT_UM = 1.0
+"""Some controllers (GRBL) report micrometres, not steps."""
+
 REST_MS = 1500.0
 """No lens this is for rings or brakes longer after a stop."""
 
@@ -116,7 +119,8 @@ class Errands:
         except BaseException:
             self._stop_hard()
             raise
-        if not cancelled and abs(report.steps - target) >= 1.0:
+        off_um = abs(self._scale.to_um(report.steps) - self._scale.to_um(target))
+        if not cancelled and abs(report.steps - target) >= 1.0 and off_um >= REPORT_UM:
             raise LensError(
                 f"lens: rests at {self._scale.to_um(report.steps):.2f} um, sent to {target_um:.2f} um; "
                 "check its limit switches and the motor's current, then home it"

@@ -36,6 +36,14 @@ def test_a_move_ends_at_rest_where_it_was_sent(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_place_between_whole_micrometres_is_reached_too(kind: str) -> None:
+    rig = open_rig(kind)
+    arrival = errands(rig).move_to(1096.44, SPEED_UM_S)
+    assert rig.rotor * UM_PER_STEP == pytest.approx(1096.44, abs=UM_PER_STEP)
+    assert arrival.um == pytest.approx(1096.44, abs=1.0)  # GRBL reports micrometres
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_jog_is_relative_and_refused_whole_beyond_a_limit(kind: str) -> None:
     rig = open_rig(kind)
     job = errands(rig)

@@ -6,15 +6,17 @@ No base class: a driver owns a ``BytePort`` and a ``Trajectory`` and uses what i
 from __future__ import annotations
 
 import math
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from elpd.errors import ConfigError, UsageError
-from elpd.records import LensLimits
+from elpd.records import LensLimits, StopMode
 from elpd.units import NS_PER_S, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from elpd.records import LensCapabilities, StopTiming
 
 T = TypeVar("T")
 
@@ -105,3 +107,17 @@ def run_target(
     if referenced:
         end = min(max(end, limits.min_steps), limits.max_steps)
     return math.floor(end) if way > 0 else math.ceil(end)
+
+
+def with_measured_stop(assumed: LensCapabilities, measured: Mapping[StopMode, StopTiming]) -> LensCapabilities:
+    """Return the capabilities with the stop that a cycle uses as it was measured, if it was."""
+    stop = measured.get(StopMode.ABRUPT if assumed.abrupt_stop else StopMode.RAMPED)
+    if stop is None:
+        return assumed
+    return replace(
+        assumed,
+        stop_onset_ms=stop.onset_ms,
+        stop_onset_sigma_ms=stop.onset_sigma_ms,
+        stop_deceleration_sps2=stop.deceleration_sps2,
+        stop_deceleration_sigma_sps2=stop.deceleration_sigma_sps2,
+    )

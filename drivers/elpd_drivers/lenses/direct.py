@@ -19,14 +19,14 @@ from elpd.errors import LensError, UsageError
 from elpd.motion.trajectory import REST, Motion
 from elpd.records import CommandStamp, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
-from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target
+from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target, with_measured_stop
 from elpd_drivers.lenses.line import Trouble
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import Clock
-    from elpd.records import LensCapabilities, LensLimits, PositionEstimate
+    from elpd.records import LensCapabilities, LensLimits, PositionEstimate, StopTiming
     from elpd.units import Steps
     from elpd_drivers.lenses.asking import Asking
     from elpd_drivers.lenses.line import Line, Sent
@@ -179,6 +179,7 @@ class DirectLens:
         self._clock, self._latency, self._poll_ms = clock, latency, poll_ms
         self._limit = False
         self._obeyed_ns = 0
+        self._measured: dict[StopMode, StopTiming] = {}
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -189,8 +190,12 @@ class DirectLens:
 
     @property
     def capabilities(self) -> LensCapabilities:
-        """What this controller can truly do."""
-        return self._controller.capabilities
+        """What this controller can truly do; its stops as they were measured, if they were."""
+        return with_measured_stop(self._controller.capabilities, self._measured)
+
+    def learn_stops(self, measured: Mapping[StopMode, StopTiming]) -> None:
+        """Model stops by what was measured of them."""
+        self._measured.update(measured)
 
     def connect(self) -> None:
         """Identify the controller, halt it if it moves, and take its first report."""
@@ -253,12 +258,19 @@ class DirectLens:
         self._motor.stops += 1
         sent = self._line.send(self._controller.stop_bytes[mode])
         effective = sent.off_wire_ns + self._latency.usual_ns
+        measured = self._measured.get(mode)
+        if measured is not None:
+            effective = sent.done_ns + round(measured.onset_ms * NS_PER_MS)
         if self._motor.known:
             _, velocity_sps = self._motor.state_at(effective)
             half_ns = self._controller.stopped(mode, sent, abs(velocity_sps)) // 2
             ramped = mode is StopMode.RAMPED or self._controller.abrupt_is_ramped
-            motion = Motion(self.limits.acceleration_sps2, rounding_steps=0.3) if ramped else REST
             sigma_ns = math.hypot(self._latency.sigma_ns, half_ns)
+            braking_sps2 = self.limits.acceleration_sps2
+            if measured is not None:
+                half_ns, sigma_ns = 0, measured.onset_sigma_ms * NS_PER_MS
+                braking_sps2 = measured.deceleration_sps2 or braking_sps2
+            motion = Motion(braking_sps2, rounding_steps=0.3) if ramped else REST
             self._motor.command(motion, effective + half_ns, sigma_ns, grace_ms=STOP_GRACE_MS)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 

@@ -24,7 +24,14 @@ from elpd.motion.trajectory import REST, Motion, Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.asking import Asking
-from elpd_drivers.lenses.axis import check_output, check_speed, check_target, limits_from, run_target
+from elpd_drivers.lenses.axis import (
+    check_output,
+    check_speed,
+    check_target,
+    limits_from,
+    run_target,
+    with_measured_stop,
+)
 from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
@@ -46,8 +53,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
-    from elpd.records import LensLimits, PositionEstimate
-    from elpd_drivers.lenses.line import Line
+    from elpd.records import LensLimits, PositionEstimate, StopTiming
+    from elpd_drivers.lenses.line import Line, Sent
 
 SEGMENT_S = 0.010
 STOPS_TRIED = 3
@@ -84,6 +91,7 @@ class GrblLens:
         self._unacknowledged: deque[int | None] = deque()
         self._status: Status | None = None
         self._wish: _Wish | None = None
+        self._measured: dict[StopMode, StopTiming] = {}
         self._cruise_sps = 0.0
         self._stopping = False
         self._resetting = self._locked_by_stop = False
@@ -103,7 +111,7 @@ class GrblLens:
     @property
     def capabilities(self) -> LensCapabilities:
         """No velocity mode, a stop that comes late, no dead-man: sweep past and return."""
-        return LensCapabilities(
+        assumed = LensCapabilities(
             native_velocity=False,
             abrupt_stop=False,
             stop_on_command=True,
@@ -112,6 +120,11 @@ class GrblLens:
             stop_onset_sigma_ms=self._stop_onset_sigma_ms,
             watchdog_ms=None,
         )
+        return with_measured_stop(assumed, self._measured)
+
+    def learn_stops(self, measured: Mapping[StopMode, StopTiming]) -> None:
+        """Model stops by what was measured of them. An abrupt one is a reset and has nothing to learn."""
+        self._measured.update(measured)
 
     def connect(self) -> None:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
@@ -155,7 +168,7 @@ class GrblLens:
             self._resetting = self._locked_by_stop = True
             self._restarted_by_ns = after_ms(self._clock.now_ns(), RESTART_MS)
         sent = self._line.send(data)
-        self._note_stop(mode, sent.off_wire_ns)
+        self._note_stop(mode, sent)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 
     def poll(self) -> LensReport | None:
@@ -286,7 +299,7 @@ class GrblLens:
             self.stop(StopMode.RAMPED)  # one came from another thread while this was on its way: it wins
         return CommandStamp(name, sent.begun_ns, sent.done_ns)
 
-    def _note_stop(self, mode: StopMode, sent_ns: int) -> None:
+    def _note_stop(self, mode: StopMode, sent: Sent) -> None:
         motor = self._motor
         if not motor.known:
             return
@@ -294,13 +307,18 @@ class GrblLens:
             moving = self._busy() or (motor.report is not None and motor.report.moving)
             motor.referenced = motor.referenced and not moving
             self._unacknowledged.clear()
-            motor.command(REST, sent_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
+            motor.command(REST, sent.off_wire_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
         elif not self._stopping and self._busy():
-            onset_ns = sent_ns + round(self._stop_onset_ms * NS_PER_MS)
+            onset_ns = sent.off_wire_ns + round(self._stop_onset_ms * NS_PER_MS)
+            sigma_ms, braking_sps2 = self._stop_onset_sigma_ms, self._limits.acceleration_sps2
+            measured = self._measured.get(mode)
+            if measured is not None:
+                onset_ns = sent.done_ns + round(measured.onset_ms * NS_PER_MS)
+                sigma_ms, braking_sps2 = measured.onset_sigma_ms, measured.deceleration_sps2 or braking_sps2
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
-                braking = Motion(self._limits.acceleration_sps2, segment_s=SEGMENT_S)
-                motor.command(braking, onset_ns, self._stop_onset_sigma_ms * NS_PER_MS, grace_ms=60)
+                braking = Motion(braking_sps2, segment_s=SEGMENT_S)
+                motor.command(braking, onset_ns, sigma_ms * NS_PER_MS, grace_ms=60)
         self._stopping = True
 
     def _take_next_step(self) -> None:

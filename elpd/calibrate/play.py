@@ -1,0 +1,89 @@
+"""The profile of the play between motor and glass, and what a focus cycle takes from it.
+
+How it is measured is in ``elpd.calibrate.backlash``; this is light, because every command that moves the lens reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import structlog
+from pydantic import BaseModel, ConfigDict
+
+from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, state_directory
+from elpd.calibrate.quantity import Quantity  # noqa: TC001  (a model needs the types of its fields)
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from elpd.config import Config
+
+SURELY_SIGMAS = 3.0
+"""The final approach begins behind the target by the play and so many of its standard errors."""
+
+
+class Reading(BaseModel):
+    """Where one pass saw focus, on the motor's ruler; ``speed_um_s`` is signed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    speed_um_s: float
+    focus_um: float
+    sigma_um: float
+
+
+class BacklashCalibration(Profile):
+    """What was measured of the play."""
+
+    KIND: ClassVar[str] = "backlash"
+    VERSION: ClassVar[int] = 1
+
+    backlash_um: Quantity
+    lag_us: Quantity
+    """Of everything that answers late, photoreceptors, thresholds and clock together, in this scene."""
+    readings: tuple[Reading, ...]
+
+    @property
+    def approach_um(self) -> float:
+        """How far behind its target a final approach must begin. Zero play is possible, negative is not."""
+        value, sigma = self.backlash_um.value or 0.0, self.backlash_um.sigma or 0.0
+        return max(value, 0.0) + SURELY_SIGMAS * sigma
+
+
+@dataclass(frozen=True, slots=True)
+class Play:
+    """Play and lag, or why not, and what the single passes read."""
+
+    backlash_um: Quantity
+    lag_us: Quantity
+    readings: tuple[Reading, ...]
+
+
+def backlash_profile(config: Config) -> BacklashCalibration | None:
+    """Return the profile of the configured lens's play, ``None`` if there is none, another lens's, or none wanted.
+
+    Raises ``FormatError`` for a profile that is damaged.
+    """
+    if not config.state.profiles:
+        return None
+    directory = state_directory(config)
+    stored = load(directory, BacklashCalibration)
+    if stored is None or stored.backlash_um.value is None:
+        return None
+    difference = stored.on.difference(MeasuredOn.lens(config, ruler=True))
+    if difference is not None:
+        path = path_of(directory, BacklashCalibration)
+        structlog.get_logger(__name__).warning("backlash profile not used", path=str(path), reason=difference)
+        return None
+    return stored
+
+
+def backlash_calibration(play: Play, on: MeasuredOn, when: datetime | None = None) -> BacklashCalibration:
+    """Make a profile of what was measured on a lens."""
+    return BacklashCalibration(
+        **BacklashCalibration.head(on, when),
+        backlash_um=play.backlash_um,
+        lag_us=play.lag_us,
+        readings=play.readings,
+    )
