@@ -238,6 +238,7 @@ class Phase(Enum):
     PROBE = "probe"
     SWEEP = "sweep"
     STOP = "stop"
+    RECROSS = "recross"
     RETURN = "return"
     VERIFY = "verify"
     DONE = "done"

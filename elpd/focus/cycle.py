@@ -20,6 +20,7 @@ from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
 from elpd.focus.search import Search
+from elpd.focus.second_pass import pass_again
 from elpd.focus.stage import REST_LIMIT_MS, Stage
 from elpd.focus.watch import Watch, WatchSettings
 from elpd.ports import Biases, HardwareRoi
@@ -162,12 +163,13 @@ class FocusCycle:
         stop_um = self._stop_um = self._stage.to_um(rest.steps)
         self._stop_latency_us = latency_us(self._stage, watch, rest)
         sign = self._details["sweep_sign"]
-        estimate = self._judge(watch, sign, passed.begun_um, stop_um)
+        estimate, furthest_um = self._estimate_twice(watch, sign, stop_um)
+        estimate = self._judge(watch, estimate, sign, passed.begun_um, furthest_um)
         self._phase(Phase.RETURN)
         way = go_back(self._stage, watch, self._settings, estimate.focus_um, sign)
         self._phase(Phase.VERIFY)
         self._details["return_events"] = verify(
-            self._stage, watch, self._settings, way, focus_um=estimate.focus_um, stop_um=stop_um
+            self._stage, watch, self._settings, way, focus_um=estimate.focus_um, stop_um=furthest_um
         )
         return Outcome.FOCUSED, self._sentence(estimate)
 
@@ -265,9 +267,26 @@ class FocusCycle:
             self._reversals = search.reversals
             self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
-    def _judge(self, watch: Watch, sign: int, begun_um: float, stop_um: float) -> FocusEstimate:
+    def _estimate_twice(self, watch: Watch, sign: int, stop_um: float) -> tuple[FocusEstimate | None, float]:
+        """Say where focus was, after a second pass if the first's evidence is not good enough; and where the lens is.
+
+        Not good enough are an answer beyond the limit, none at all, and one from a scene that moved already while the
+        lens stood still: then only one kind of witness is left, and its lag is not measured.
+        """
+        first = watch.estimate()
+        limit_um = self._settings.max_sigma_dof * self._settings.depth_of_focus_um
+        if watch.gap_near_crossing or (first is not None and first.sigma_um <= limit_um and not watch.scene_moves):
+            return first, stop_um
+        self._phase(Phase.RECROSS)
+        focus_um, sigma_um = (watch.peak_um, limit_um) if first is None else (first.focus_um, first.sigma_um)
+        self._sink.note("one pass", focus_um=focus_um, sigma_um=None if first is None else sigma_um)
+        rest = pass_again(self._stage, watch, self._settings, focus_um, sigma_um, sign)
+        return watch.estimate(), self._stage.to_um(rest.steps)
+
+    def _judge(
+        self, watch: Watch, estimate: FocusEstimate | None, sign: int, begun_um: float, stop_um: float
+    ) -> FocusEstimate:
         """Say where focus was, and refuse an answer that the evidence does not carry."""
-        estimate = watch.estimate()
         if estimate is None:
             raise Ended(
                 Outcome.LOW_CONFIDENCE,

@@ -15,23 +15,21 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from elpd.events.stream import PacketDecoder
+from elpd.focus.passes import Pass, lens_path
+from elpd.focus.resting import RestingScene
 from elpd.records import Direction, ElpSample
 from elpd.units import SensorUs
+from elpd.vision.bearing import Bearing
 from elpd.vision.crossing import (
     LAG_UNEXPLAINED,
     ROI_MARGIN_PX,
-    UNMEASURED_LAG_US,
     WIDTHS_PER_DEPTH_OF_FOCUS,
-    Witness,
-    frame_witness,
     fuse,
 )
-from elpd.vision.detector import Detector, RestingRate
+from elpd.vision.detector import Detector
 from elpd.vision.elp import ElpWindows
 from elpd.vision.memory import EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
-from elpd.vision.ruler import Ruler
-from elpd.vision.track import FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,9 +38,6 @@ if TYPE_CHECKING:
     from elpd.vision.reference import Reference
 
 REST_WINDOW_US = 1000
-PATH_STEP_US = 250
-"""The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
-
 LOOK_BACK_DOF = 12.0
 """Losses this far back from the decision count against it: the witnesses look no further."""
 
@@ -126,10 +121,10 @@ class Watch:
         inside = np.zeros((geometry.height, geometry.width), np.bool_)
         inside[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width] = True
         self._inside = inside
-        self._resting = ElpWindows(reference.weights, inside, window_us=REST_WINDOW_US, rate_cap=True)
-        self._rest_sums = [0, 0, 0]  # elp, events, us
+        self._resting_windows = ElpWindows(reference.weights, inside, window_us=REST_WINDOW_US, rate_cap=True)
+        self._resting = RestingScene(roi, geometry)
         self._windows: ElpWindows | None = None
-        self._rest = RestingRate()
+        self._bearing: Bearing | None = None
         self._detector = Detector()
         self._decoder = PacketDecoder(geometry)
         self._memory = EventMemory(roi, geometry)
@@ -142,6 +137,7 @@ class Watch:
         self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
         self._frames: list[Frame] = []
+        self._passes: list[Pass] = []
         self.decided_us: SensorUs | None = None
         """When the window that decided was complete, on the sensor's clock."""
         self.events = 0
@@ -153,27 +149,35 @@ class Watch:
 
     def rest(self, packet: CameraPacket) -> None:
         """Learn from a packet of a sensor that sees nothing move."""
-        for row in self._resting.feed(packet):
-            self._rest_sums[0] += int(row["elp"])
-            self._rest_sums[1] += int(row["n_on"] + row["n_off"])
-            self._rest_sums[2] += int(row["end_us"] - row["begin_us"])
-        self._decoder.feed(packet)
+        for row in self._resting_windows.feed(packet):
+            duration_us = int(row["end_us"] - row["begin_us"])
+            self._resting.take_window(int(row["elp"]), int(row["n_on"] + row["n_off"]), duration_us)
+        self._resting.take(self._decoder.feed(packet), packet.frames)
 
     def armed(self) -> None:
         """Close the lesson of the resting sensor."""
-        elp, events, us = self._rest_sums
-        if us > 0:
-            self._rest = RestingRate(elp / us, events / us)
+        self._resting.close()
+
+    @property
+    def scene_moves(self) -> bool:
+        """Whether the scene moved while the lens stood still."""
+        return self._resting.moves
+
+    @property
+    def frame_period_us(self) -> float | None:
+        """Time from one frame to the next, as seen so far; ``None`` if there were not two."""
+        times = [int(frame.t_us) for frame in (*self._resting.frames, *self._frames)]
+        return float(np.median(np.diff(times))) if len(times) > 1 else None
 
     @property
     def resting_rate_hz(self) -> float:
-        """Events per second that the region sends at rest."""
-        return 1e6 * self._rest.events_per_us
+        """Events per second that noise makes in the region: what it sends at rest, unless the scene moved."""
+        return 0.0 if self.scene_moves else 1e6 * self._resting.rate.events_per_us
 
     @property
     def resting_events(self) -> int:
         """How many events the resting rate was learnt from."""
-        return self._rest_sums[1]
+        return self._resting.events
 
     def begin(self, sign: int, at_us: SensorUs, turned_at_um: float | None = None) -> None:
         """Begin a direction of travel: everything is judged afresh.
@@ -182,19 +186,24 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry)
+        self._memory = self._resting.image_at_start() if self._windows is None else self._gone_on_with()
+        if self.scene_moves:
+            self._bearing = Bearing(
+                ROI_MARGIN_PX, pictured=self._memory.picture is not None, again=turned_at_um is not None
+            )
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
         self._detector = Detector(
-            self._rest, recede_sigmas=SIGMAS_OF_PROBE if turned_at_um is None else SIGMAS_AFTER_REVERSAL
+            self._resting.rate, recede_sigmas=SIGMAS_OF_PROBE if turned_at_um is None else SIGMAS_AFTER_REVERSAL
         )
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
         self._samples = []
         self._frames = []
+        self._passes = []
         self._gaps_us = []
         self.decided_us = None
         self.events = 0
@@ -212,14 +221,19 @@ class Watch:
             duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
-            self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
+            ticked = self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
             self._detector.feed(sample)
             seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
+            if self._bearing is not None:
+                if ticked:
+                    self._bearing.look(self._memory.image())
+                seen = self._bearing.direction is Direction.APPROACHING
             if seen and not self._passed and self._memory.peak_passed and self._memory.track.drop > FAR_DROP:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
+                self._keep_pass(self._settings.speed_um_s)
         self._samples += samples
         self.events_in_cycle += sum(sample.n_on + sample.n_off for sample in samples)
         for frame in packet.frames:
@@ -233,17 +247,18 @@ class Watch:
         if packet.gap_before:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
-        if self._passed:
-            return  # a motor that brakes late goes far beyond what is of interest
         first = int(np.searchsorted(events.t, self._begun_us, side="left"))
-        self._memory.add(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+        # A motor that brakes late goes far beyond what is of interest.
+        take = self._memory.skim if self._passed else self._memory.add
+        take(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
 
-    def _tick(self, sample: ElpSample, end_um: float) -> None:
-        """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
+    def _tick(self, sample: ElpSample, end_um: float) -> bool:
+        """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel. Say whether it was time."""
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
-            return
+            return False
         self._ticked_um = self._here_um = end_um
         self._memory.advance(sample.end_us, self._sign * end_um)
+        return True
 
     @property
     def passed(self) -> bool:
@@ -261,6 +276,8 @@ class Watch:
         Once ELP has said "ahead", a change of its mind is no reason to turn round at once: with a picture from far away
         it comes some depths of focus early, and the sharpness of the image has the say.
         """
+        if self._bearing is not None:
+            return self._bearing.direction
         mutation = self._detector.mutation
         if mutation is not None and not self._passed:
             beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
@@ -283,37 +300,46 @@ class Watch:
         """
         if self.decided_us is None:
             return None
-        memory = self._memory
-        ruler = self._ruler(self._begun_us, self.decided_us)
-        deaf = memory.refractory()
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us)
-        if said is None:
-            return None
-        speed_um_us = 1e-6 * self._settings.speed_um_s
-        unmeasured_lag_um = UNMEASURED_LAG_US * speed_um_us
         unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
         width_um = WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
         witnesses = [
-            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(unmeasured_lag_um, unexplained, width_um)
+            witness
+            for one in self._passes
+            for witness in one.testify(
+                lens_path(self._locate, one.begun_us, one.decided_us),
+                self.roi,
+                self._reference.brightness,
+                unexplained,
+                width_um,
+                scene_moves=self.scene_moves,
+            )
         ]
-        found = fuse([*self._ask_frames(), *witnesses])
+        found = fuse(witnesses)
         if found is None:
             return None
         sign = self._sign
         return replace(
             found,
+            method="two_crossings" if len(self._passes) > 1 else found.method,
             focus_um=sign * found.focus_um,
             contributions=tuple((name, sign * at, sigma, share) for name, at, sigma, share in found.contributions),
         )
 
     @property
+    def peak_um(self) -> float:
+        """Where the image was sharpest, in the last pass."""
+        track = self._memory.track
+        return self._sign * track.positions[track.peak]
+
+    @property
     def gap_near_crossing(self) -> bool:
-        """Whether anything was lost in the last part of the sweep, where the estimate comes from."""
-        if not self._gaps_us or self.decided_us is None:
-            return False
-        look_back_us = 1e6 * LOOK_BACK_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
-        return any(self.decided_us - look_back_us <= gap <= self.decided_us for gap in self._gaps_us)
+        """Whether anything was lost in the last part of a pass, where the estimate comes from."""
+        reach_um = LOOK_BACK_DOF * self._settings.depth_of_focus_um
+        return any(
+            one.decided_us - 1e6 * reach_um / one.speed_um_s <= gap <= one.decided_us
+            for one in self._passes
+            for gap in self._gaps_us
+        )
 
     def events_within(self, from_um: float, to_um: float) -> int:
         """Return how many events the sweep saw between two places."""
@@ -326,7 +352,59 @@ class Watch:
         for row in self._windows.feed(packet):
             self.events_in_cycle += int(row["n_on"] + row["n_off"])
 
+    # --- a second pass ---
+
+    def follow(self, packet: CameraPacket) -> None:
+        """Let the region's events go on building their image, and count them, while the lens goes where it is sent."""
+        assert self._windows is not None, "begin() comes before follow()"
+        self.keep(packet)
+        for row in self._windows.feed(packet):
+            self.events_in_cycle += int(row["n_on"] + row["n_off"])
+
+    def begin_again(self, speed_um_s: float, at_us: SensorUs, from_um: float) -> None:
+        """Begin to pass focus a second time, in the same direction, at another speed.
+
+        The image is gone on with; its sharpness is followed from *from_um* on, where the play has been taken up.
+        """
+        self._memory = self._gone_on_with()
+        self._ticked_um = self._here_um = float("nan")
+        self._begun_us, self._judge_from, self._passed = at_us, self._sign * from_um, False
+        self._frames = []
+        self._speed_again_um_s = speed_um_s
+
+    def pass_again(self, packet: CameraPacket) -> None:
+        """Follow the image's sharpness in a packet of the second pass."""
+        assert self._windows is not None, "begin() comes before pass_again()"
+        self.keep(packet)
+        self._frames += packet.frames
+        for row in self._windows.feed(packet):
+            sample = self._located(row)
+            self.events_in_cycle += sample.n_on + sample.n_off
+            end_um = sample.position_um + 0.5 * sample.travel_um
+            if sample.begin_us >= self._begun_us and self._sign * end_um >= self._judge_from:
+                self._tick(sample, end_um)
+
+    def passed_again(self) -> None:
+        """End the second pass: what it saw testifies beside the first's."""
+        self.decided_us = self._last_us
+        self._keep_pass(self._speed_again_um_s)
+        self._passed = True
+
     # --- pieces ---
+
+    def _gone_on_with(self) -> EventMemory:
+        """Return a new memory that goes on with the image so far.
+
+        Built anew, it would begin with the negative of what the scene looked like where the lens turned, perhaps close
+        to focus, and when the scene moves the difference of two sharp pictures is sharpest anywhere.
+        """
+        return EventMemory(self.roi, self._geometry, before=self._memory)
+
+    def _keep_pass(self, speed_um_s: float) -> None:
+        assert self.decided_us is not None
+        self._passes.append(
+            Pass(self._memory, tuple(self._frames), self._begun_us, self.decided_us, self._sign, speed_um_s)
+        )
 
     def _located(self, row: Any) -> ElpSample:
         begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))
@@ -348,20 +426,3 @@ class Watch:
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
-
-    def _ruler(self, begin_us: int, end_us: int) -> Ruler:
-        """Return the lens's path between two sensor times, finely sampled."""
-        grid = np.arange(begin_us, end_us + 4 * PATH_STEP_US, PATH_STEP_US, dtype=np.float64)
-        return Ruler.of_path(grid, np.array([self._locate(SensorUs(int(when))) for when in grid]))
-
-    def _ask_frames(self) -> list[Witness]:
-        """Ask the frames of this sweep, where three or more saw focus come and go."""
-        track = PeakTrack()
-        energy = FrameEnergy(self.roi, ROI_MARGIN_PX)
-        for frame in self._frames:
-            if frame.t_us >= self._begun_us:
-                track.add(int(frame.t_us), self._sign * self._locate(frame.t_us), energy.measure(frame.pixels))
-        vertex = track.vertex() if track.passed else None
-        if vertex is None:
-            return []
-        return [frame_witness(vertex, float(np.median(np.diff(track.positions))))]

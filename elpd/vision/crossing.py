@@ -99,7 +99,10 @@ class Witness:
 
 @dataclass(frozen=True, slots=True)
 class EventStretch:
-    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions."""
+    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions.
+
+    ``base``, (height, width), is the image in thresholds that earlier events had built; ``None`` for nothing.
+    """
 
     t_us: NDArray[np.int64]
     x: NDArray[np.uint16]
@@ -109,6 +112,7 @@ class EventStretch:
     height: int
     width: int
     margin: int
+    base: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +258,8 @@ def _rebuilt_curve(
     rebuild_levels(starts, order, events.position, events.on, ticks, level, squares)
     mismatch = MISMATCH**2 * squares.sum(axis=1) / pixels
     images = level.reshape(ticks.size, events.height, events.width)
+    if events.base is not None:
+        images += events.base
     curve = np.zeros(ticks.size)
     for band in BANDS_PX:
         energy = np.array([band_energy(image, band, weight, events.margin) for image in images])

@@ -55,6 +55,16 @@ def band_gain(scale_px: float) -> float:
     return band_energy(impulse, scale_px, np.ones_like(impulse)) * impulse.size
 
 
+def band_patch(scale_px: float) -> float:
+    """Return over how many pixels white noise is one and the same in a band: the patch that counts as one sample."""
+    impulse = np.zeros((65, 65), dtype=np.float32)
+    impulse[32, 32] = 1.0
+    kernel_image = cv2.GaussianBlur(impulse, (0, 0), scale_px)
+    kernel_image -= cv2.GaussianBlur(impulse, (0, 0), scale_px * _BAND_RATIO)
+    power = np.square(np.abs(np.fft.fft2(kernel_image)))
+    return float(np.square(power).mean() / power.mean() ** 2)
+
+
 @kernel("void(uint16[::1], uint16[::1], uint8[::1], int32[:, ::1])")
 def add_events(
     x: NDArray[np.uint16],

@@ -29,7 +29,12 @@ RISE = 0.10
 FIT_DROP = 0.25
 """How far down the curve's sides a parabola is believed."""
 
-_FRAME_GROUND = 10.0 / 255.0
+FRAME_GROUND = 10.0 / 255.0
+"""Added to a frame's brightness, of which one is full scale, before its logarithm: read noise shows no structure."""
+
+USUAL_THRESHOLD = 0.2
+"""A contrast threshold of event cameras as they are set. A direction is right with a third less or more of it."""
+
 _FLOOR = 1e-12
 
 
@@ -126,6 +131,13 @@ class PeakTrack:
         return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))
 
 
+def frame_levels(pixels: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Return a frame's log brightness, (height, width), counted in contrast thresholds of a usual setting."""
+    scale = full_scale(pixels) or 1.0
+    image = pixels.astype(np.float32) / np.float32(scale)
+    return np.asarray(np.log(image + np.float32(FRAME_GROUND)) / np.float32(USUAL_THRESHOLD), dtype=np.float32)
+
+
 class FrameEnergy:
     """``log S`` of whole frames over a region, weighted by the brightness of the first."""
 
@@ -146,15 +158,16 @@ class FrameEnergy:
             self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
-        energy = band_energy(np.log(image + np.float32(_FRAME_GROUND)), BANDS_PX[0], self._weight * inside)
+        energy = band_energy(np.log(image + np.float32(FRAME_GROUND)), BANDS_PX[0], self._weight * inside)
         return float(np.log(energy + _FLOOR))
 
 
 class EventEnergy:
-    """``log S`` of the image that events build, from nothing."""
+    """``log S`` of the image that events build, from nothing or upon a *picture* in thresholds, (height, width)."""
 
-    def __init__(self, height: int, width: int, margin: int) -> None:
+    def __init__(self, height: int, width: int, margin: int, picture: NDArray[np.float32] | None = None) -> None:
         self.level = np.zeros((height, width), dtype=np.int32)
+        self.picture = picture
         self._margin = margin
         self._weight = np.ones((height, width), dtype=np.float32)
 
@@ -162,8 +175,13 @@ class EventEnergy:
         """Take events, in coordinates of the image."""
         add_events(x, y, on, self.level)
 
+    def image(self) -> NDArray[np.float32]:
+        """Return the image now, in thresholds."""
+        image = self.level.astype(np.float32)
+        if self.picture is not None:
+            image += self.picture
+        return image
+
     def measure(self) -> float:
         """Return log S now."""
-        return float(
-            np.log(band_energy(self.level.astype(np.float32), BANDS_PX[0], self._weight, self._margin) + _FLOOR)
-        )
+        return float(np.log(band_energy(self.image(), BANDS_PX[0], self._weight, self._margin) + _FLOOR))
