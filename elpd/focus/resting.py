@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from elpd.events.decoder import EventArrays
     from elpd.records import Frame, Geometry, Roi
 
-SIGMAS_OF_MOTION = 3.0
+SIGMAS_OF_MOTION = 4.0
 """How much more order than independent events have shows that the scene moved while the lens stood still. A false
-alarm, one in a thousand, costs a second pass."""
+alarm costs a second pass."""
 
 
 class RestingScene:

@@ -28,8 +28,8 @@ of log S has fallen by a third."""
 MOST_DOUBT_DOF = 1.0
 """An answer that is off by more than this beside the reach has no second opinion."""
 
-FRAMES = 6
-"""How many frames the second pass makes time for: three for a parabola, as many again to judge it by."""
+FRAMES = 5
+"""How many frames the second pass makes time for: three for a parabola, two to judge it by."""
 
 
 def pass_again(

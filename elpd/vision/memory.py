@@ -151,11 +151,12 @@ class EventMemory:
         level = np.empty(self._shape, np.int32)
         self.copy_image(level)
         image = level.astype(np.float32)
-        by_itself = band_gain(ORDER_PX) * float(np.square(image).mean())
+        inside = image[ROI_MARGIN_PX:-ROI_MARGIN_PX, ROI_MARGIN_PX:-ROI_MARGIN_PX]
+        by_itself = band_gain(ORDER_PX) * float(np.square(inside).mean()) if inside.size else 0.0
         if by_itself == 0.0:
             return 0.0
-        excess = band_energy(image, ORDER_PX, np.ones_like(image)) / by_itself - 1.0
-        return excess / float(np.sqrt(2.0 * band_patch(ORDER_PX) / image.size))
+        excess = band_energy(image, ORDER_PX, np.ones_like(image), ROI_MARGIN_PX) / by_itself - 1.0
+        return excess / float(np.sqrt(2.0 * band_patch(ORDER_PX) / inside.size))
 
     def copy_image(self, into: NDArray[np.int32]) -> None:
         """Copy the image that all events so far have built, in thresholds, those after the last ``advance`` too."""

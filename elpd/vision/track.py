@@ -32,6 +32,9 @@ FIT_DROP = 0.25
 FRAME_GROUND = 10.0 / 255.0
 """Added to a frame's brightness, of which one is full scale, before its logarithm: read noise shows no structure."""
 
+FOLLOW_PX = 1.2
+"""Scale of the structure by which a scene is followed: it is there in every frame around focus."""
+
 USUAL_THRESHOLD = 0.2
 """A contrast threshold of event cameras as they are set. A direction is right with a third less or more of it."""
 
@@ -139,11 +142,18 @@ def frame_levels(pixels: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 class FrameEnergy:
-    """``log S`` of whole frames over a region, weighted by the brightness of the first."""
+    """``log S`` of whole frames over a region, weighted by the brightness of the first.
 
-    def __init__(self, roi: Roi, margin: int) -> None:
+    With *follow* the region goes with the scene, from frame to frame by phase correlation, as far as the margin lets
+    it: what a shaking hand moves in and out of a region that stands still would pass for focus.
+    """
+
+    def __init__(self, roi: Roi, margin: int, *, follow: bool = False) -> None:
         self._roi = roi
         self._margin = margin
+        self._follow = follow
+        self._before: NDArray[np.float32] | None = None
+        self._shift_px = np.zeros(2)
         self._weight: NDArray[np.float32] | None = None
 
     def measure(self, pixels: NDArray[np.generic]) -> float:
@@ -158,8 +168,22 @@ class FrameEnergy:
             self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
-        energy = band_energy(np.log(image + np.float32(FRAME_GROUND)), BANDS_PX[0], self._weight * inside)
+        levels = np.log(image + np.float32(FRAME_GROUND))
+        energy = band_energy(levels, BANDS_PX[0], self._weight * self._moved(inside, levels))
         return float(np.log(energy + _FLOOR))
+
+    def _moved(self, inside: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the region's mask where its scene has gone to."""
+        if not self._follow:
+            return inside
+        band = cv2.GaussianBlur(levels, (0, 0), FOLLOW_PX) - cv2.GaussianBlur(levels, (0, 0), 4 * FOLLOW_PX)
+        if self._before is not None:
+            window = cv2.createHanningWindow((band.shape[1], band.shape[0]), cv2.CV_32F)
+            step, _ = cv2.phaseCorrelate(self._before, np.asarray(band, np.float32), window)
+            self._shift_px = np.clip(self._shift_px + np.array(step), -self._margin, self._margin)
+        self._before = np.asarray(band, np.float32)
+        shift = np.array([[1.0, 0.0, self._shift_px[0]], [0.0, 1.0, self._shift_px[1]]])
+        return np.asarray(cv2.warpAffine(inside, shift, (inside.shape[1], inside.shape[0])), np.float32)
 
 
 class EventEnergy:
