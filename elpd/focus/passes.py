@@ -27,8 +27,8 @@ PATH_STEP_US = 250
 
 VERTEX_IN_MOTION_PER_MS = 0.003
 """What a scene that moves adds to the error of the events' vertex, in widths of the curve, for each millisecond that
-the pass over the curve took: what leaves the region and enters it tilts the curve, and thresholds that differ from pixel
-to pixel add up. 30 shaken scenes strayed by 0.33 widths (root mean square) in 100 ms."""
+the pass over the curve took: what leaves the region and enters it tilts the curve, and thresholds that differ between
+pixels add up. Thirty shaken scenes strayed by 0.33 widths (root mean square) in 100 ms."""
 
 FRAMES_IN_MOTION = 0.05
 """What scene motion adds to the error of the frames' vertex, in widths of the curve: the scene has depth and ends, and
