@@ -120,7 +120,10 @@ class Witness:
 
 @dataclass(frozen=True, slots=True)
 class EventStretch:
-    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions."""
+    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions.
+
+    ``base``, (height, width), is the image in thresholds that earlier events had built; ``None`` for nothing.
+    """
 
     t_us: NDArray[np.int64]
     x: NDArray[np.uint16]
@@ -130,6 +133,7 @@ class EventStretch:
     height: int
     width: int
     margin: int
+    base: NDArray[np.float32] | None = None
 
 
 Groups = tuple["NDArray[np.int64]", "NDArray[np.int64]"]
@@ -246,6 +250,7 @@ def _rows_of(events: EventStretch, rows: slice) -> EventStretch:
         rows.stop - rows.start,
         events.width,
         events.margin,
+        None if events.base is None else events.base[rows],
     )
 
 
@@ -341,7 +346,10 @@ def _rebuilt(
     squares = np.zeros((ticks.size, 2))
     starts, order = groups
     rebuild_levels(starts, events.position[order], events.on[order], ticks, level, squares)
-    return level.reshape(ticks.size, events.height, events.width), MISMATCH**2 * squares.sum(axis=1) / pixels
+    images = level.reshape(ticks.size, events.height, events.width)
+    if events.base is not None:
+        images += events.base
+    return images, MISMATCH**2 * squares.sum(axis=1) / pixels
 
 
 def _pair_mode(
