@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.units import SensorUs
-from elpd.vision.crossing import UNMEASURED_LAG_US, frame_witness, lamp_witness
+from elpd.vision.crossing import UNMEASURED_LAG_US, frame_witness, fuse, lamp_witness
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from elpd.records import FocusEstimate
     from elpd.vision.crossing import Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
@@ -114,6 +115,39 @@ class Pass:
         """Return what a moving scene adds to the error of the events' vertex."""
         begin_us = max(self.begun_us, int(self.end_us - 1e6 * 2.0 * self.width_um / self.speed_um_s))
         return VERTEX_IN_MOTION_PER_MS * self.width_um * (self.end_us - begin_us) / 1000.0
+
+
+class Passes:
+    """What the passes over focus in one direction have testified together."""
+
+    def __init__(self) -> None:
+        self._said: list[Testimony] = []
+        self._near_us: list[tuple[float, float]] = []
+        self.depths: tuple[float, ...] = ()
+        self.flicker: Flicker | None = None
+
+    def add(self, said: Testimony, near_us: tuple[float, float]) -> None:
+        """Take what a pass says, and from when to when it was near focus."""
+        self._said.append(said)
+        self._near_us.append(near_us)
+        self.depths = said.depths or self.depths
+        self.flicker = said.flicker or self.flicker
+
+    def hold_any(self, times_us: Sequence[int]) -> bool:
+        """Say whether any of the times was near focus."""
+        return any(begin <= when <= end for begin, end in self._near_us for when in times_us)
+
+    def estimate(self, sign: int) -> FocusEstimate | None:
+        """Return where focus is, on the motor's ruler, of passes whose places rose with *sign* times it."""
+        found = fuse([witness for said in self._said for witness in said.witnesses])
+        if found is None:
+            return None
+        return replace(
+            found,
+            method="two_crossings" if len(self._said) > 1 else found.method,
+            focus_um=sign * found.focus_um,
+            contributions=tuple((name, sign * at, sigma, share) for name, at, sigma, share in found.contributions),
+        )
 
 
 def _track_of(points: Sequence[tuple[int, float, float]]) -> PeakTrack:

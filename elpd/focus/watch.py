@@ -10,19 +10,20 @@ was.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from elpd.events.stream import PacketDecoder
 from elpd.focus.frame_track import FrameTrack
+from elpd.focus.heading import Heading
 from elpd.focus.lamplight import Lamplight, weighed
-from elpd.focus.passes import Pass, Testimony
-from elpd.records import Direction, ElpSample
+from elpd.focus.passes import Pass, Passes
+from elpd.focus.placed import Placed
+from elpd.records import Direction
 from elpd.units import SensorUs
-from elpd.vision.bearing import Bearing
-from elpd.vision.crossing import LAG_UNEXPLAINED, ROI_MARGIN_PX, WIDTHS_PER_DEPTH_OF_FOCUS, fuse
-from elpd.vision.detector import Detector, RestingRate
+from elpd.vision.crossing import LAG_UNEXPLAINED, WIDTHS_PER_DEPTH_OF_FOCUS
+from elpd.vision.detector import RestingRate
 from elpd.vision.elp import ElpWindows
 from elpd.vision.memory import BuiltImage, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
@@ -32,7 +33,7 @@ from elpd.vision.saturation import RateWatch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi, SensorProfile
+    from elpd.records import CameraPacket, ElpSample, FocusEstimate, Frame, Geometry, Roi, SensorProfile
     from elpd.vision.flicker import Flicker
     from elpd.vision.reference import Reference
 
@@ -57,12 +58,6 @@ FOR_EVER = SensorUs(1 << 62)
 LAG_UNEXPLAINED_BY_MAP = 0.15
 """Share of the lag correction that may be wrong where a temporal map, taken through a small aperture and without
 saturation, says which pixels are slow."""
-
-SIGMAS_OF_PROBE = 5.0
-"""What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
-
-SIGMAS_AFTER_REVERSAL = 9.0
-"""A false reversal costs the most: the second needs this many standard deviations."""
 
 SLOW_SHARE = 0.2
 """Windows with less than this share of the planned travel say little: the lens starts, stops or turns."""
@@ -136,9 +131,8 @@ class Watch:
         """Whether the read-out is full."""
         self._lamp: Lamplight | None = None
         self._windows: ElpWindows | None = None
-        self._bearing: Bearing | None = None
         self._rest = RestingRate()
-        self._detector = Detector()
+        self._heading = Heading(self._rest)
         self._decoder = PacketDecoder(geometry)
         self._memory = EventMemory(roi, geometry, sensor=sensor)
         self._ticked_um = self._here_um = float("nan")
@@ -146,14 +140,13 @@ class Watch:
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
         self._turned_us = FOR_EVER
-        self._located_last = (SensorUs(-1), 0.0)
+        self._placed = Placed(locate)
         self._sign = 1
         self._begun_us = SensorUs(0)
         self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
         self._frames = FrameTrack(self.roi, follow=self.scene_moves)
-        self._testimonies: list[Testimony] = []
-        self._near_focus: list[tuple[float, float]] = []
+        self._passes = Passes()
         self._unheard: list[CameraPacket] = []
         self.decided_us: SensorUs | None = None
         """When the window that decided was complete, on the sensor's clock."""
@@ -222,16 +215,14 @@ class Watch:
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
         self._remember(self.resting.image_at_start if self._windows is None else self._memory.built())
-        if self.scene_moves:
-            self._bearing = Bearing(ROI_MARGIN_PX, pictured=self._memory.pictured, again=turned_at_um is not None)
         if self._lamp is not None:
             self._lamp.begin(at_us)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
-        self._detector = Detector(
-            self._rest, recede_sigmas=SIGMAS_OF_PROBE if turned_at_um is None else SIGMAS_AFTER_REVERSAL
+        self._heading = Heading.of_sweep(
+            self._rest, self._memory, again=turned_at_um is not None, scene_moves=self.scene_moves
         )
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
@@ -239,7 +230,7 @@ class Watch:
         self._samples = []
         self._frames = FrameTrack(self.roi, follow=self.scene_moves)
         self._gaps_us = []
-        self._testimonies, self._near_focus, self._unheard = [], [], []
+        self._passes, self._unheard = Passes(), []
         self.decided_us = None
         self._turned_us = FOR_EVER
         self.events = 0
@@ -251,7 +242,7 @@ class Watch:
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
@@ -260,13 +251,8 @@ class Watch:
             ticked = self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
-            self._detector.feed(sample)
-            seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if self._bearing is not None:
-                if ticked:
-                    self._bearing.look(self._memory.image)
-                seen = self._bearing.direction is Direction.APPROACHING
-            if seen and not self._passed and self._memory.peak_passed:
+            self._heading.feed(sample, self._memory, ticked=ticked)
+            if self._heading.seen_ahead and not self._passed and self._memory.peak_passed:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
@@ -331,22 +317,19 @@ class Watch:
         sharper: far from focus a lens shows some fine structure with its bright and dark exchanged, and a reference
         made of that points the wrong way. Where the scene moves, sharpness alone is asked (``vision.bearing``).
         """
-        if self._bearing is not None:
-            return self._bearing.direction
-        mutation = self._detector.mutation
-        if mutation is not None and not self._passed:
+        changed_us = self._heading.changed_us
+        if changed_us is not None and not self._passed:
             if self._frames.sharpens:
                 return Direction.APPROACHING
-            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
+            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(changed_us)))
             if beyond_um < PATIENCE_DOF * self._settings.depth_of_focus_um:
                 return Direction.APPROACHING
-        return self._detector.direction
+        return self._heading.direction
 
     @property
     def score(self) -> float:
         """The running evidence in standard deviations: positive while focus is ahead, negative once it is behind."""
-        rally, drawdown = self._detector.approach_score, self._detector.recede_score
-        return -drawdown if drawdown > rally else rally
+        return self._heading.score
 
     # --- after the stop ---
 
@@ -373,24 +356,11 @@ class Watch:
         else:
             unexplained = LAG_UNEXPLAINED if self._settings.frames else LAG_UNEXPLAINED_BY_MAP
             said = one.testify(self._locate, self._reference.brightness, unexplained)
-        self._testimonies.append(said)
         look_back_us = 1e6 * LOOK_BACK_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
-        self._near_focus.append((self.decided_us - look_back_us, self.decided_us))
-        self.flicker = said.flicker or self.flicker
-        self.depths_um = tuple(self._sign * at for at in said.depths) or self.depths_um
-        return self._on_the_ruler(fuse([witness for said in self._testimonies for witness in said.witnesses]))
-
-    def _on_the_ruler(self, found: FocusEstimate | None) -> FocusEstimate | None:
-        """Turn an estimate on the path of the sweep, which rises, into one on the motor's ruler."""
-        if found is None:
-            return None
-        sign = self._sign
-        return replace(
-            found,
-            method="two_crossings" if len(self._testimonies) > 1 else found.method,
-            focus_um=sign * found.focus_um,
-            contributions=tuple((name, sign * at, sigma, share) for name, at, sigma, share in found.contributions),
-        )
+        self._passes.add(said, (self.decided_us - look_back_us, self.decided_us))
+        self.flicker = self._passes.flicker
+        self.depths_um = tuple(self._sign * at for at in self._passes.depths)
+        return self._passes.estimate(self._sign)
 
     @property
     def peak_um(self) -> float:
@@ -401,7 +371,7 @@ class Watch:
     @property
     def gap_near_crossing(self) -> bool:
         """Whether anything was lost in the last part of a pass, where the estimate comes from."""
-        return any(begin <= gap <= end for begin, end in self._near_focus for gap in self._gaps_us)
+        return self._passes.hold_any(self._gaps_us)
 
     def events_within(self, from_um: float, to_um: float) -> int:
         """Return how many events the sweep saw between two places."""
@@ -424,7 +394,7 @@ class Watch:
     def _count(self, packet: CameraPacket) -> None:
         assert self._windows is not None
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             self.events_in_cycle += sample.n_on + sample.n_off
 
     def return_score(self, focus_um: float) -> float | None:
@@ -442,7 +412,7 @@ class Watch:
         else:  # nobody waits for what it says, unless there is a second pass
             self._unheard.append(replace(packet, data=packet.data.copy(), frames=()))
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             if row["end_us"] <= self._turned_us:
                 self._samples.append(sample)
             count = sample.n_on + sample.n_off
@@ -478,7 +448,7 @@ class Watch:
         assert self._windows is not None, "begin() comes before pass_again()"
         self.keep(packet)
         for row in self._windows.feed(packet):
-            sample = self._located(row)
+            sample = self._placed.sample(row)
             self.events_in_cycle += sample.n_on + sample.n_off
             end_um = sample.position_um + 0.5 * sample.travel_um
             if sample.begin_us >= self._begun_us and self._sign * end_um >= self._judge_from:
@@ -512,24 +482,6 @@ class Watch:
         elif sample.begin_us >= self._begun_us:  # else only part of a period was heard
             self._memory.add(*net)
         return weighed(sample, net, self._reference.weights, self._inside)
-
-    def _located(self, row: Any) -> ElpSample:
-        begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))
-        before_us, before_um = self._located_last
-        from_um = before_um if before_us == begin else self._locate(begin)  # windows follow one another
-        to_um = self._locate(end)
-        self._located_last = end, to_um
-        return ElpSample(
-            begin,
-            end,
-            int(row["elp"]),
-            int(row["energy"]),
-            int(row["n_on"]),
-            int(row["n_off"]),
-            int(row["n_capped"]),
-            0.5 * (from_um + to_um),
-            to_um - from_um,
-        )
 
     def _take_frame(self, frame: Frame) -> None:
         self._measure_frame(frame)
