@@ -255,6 +255,7 @@ class Phase(Enum):
     PROBE = "probe"
     SWEEP = "sweep"
     STOP = "stop"
+    RECROSS = "recross"
     RETURN = "return"
     VERIFY = "verify"
     DONE = "done"
