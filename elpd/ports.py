@@ -213,6 +213,20 @@ class Identified(Protocol):
 
 
 @runtime_checkable
+class Outputs(Protocol):
+    """A lens whose controller can switch something else too, over the same line: an iris, a lamp."""
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The outputs' names; none where this controller has no output that it can be told to switch."""
+        ...
+
+    def set_output(self, name: str, *, on: bool) -> CommandStamp:
+        """Switch an output. Raises ``UsageError`` if there is none of that name, ``LensError`` if it cannot be now."""
+        ...
+
+
+@runtime_checkable
 class Closeable(Protocol):
     """Anything to give back at the end."""
 

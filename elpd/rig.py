@@ -12,7 +12,9 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
+from elpd.calibrate.aperture import with_profile
 from elpd.errors import ConfigError, DeviceError
+from elpd.motion.lens_output import aperture_on_lens
 from elpd.ports import Closeable, RigParts
 from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
@@ -67,7 +69,9 @@ def build(config: Config) -> RigParts:
         )
     else:
         parts = _hardware(config)
-    return _with_replacements(parts, config) if config.rig == "sim" else parts
+    if config.rig == "sim":
+        parts = _with_replacements(parts, config)
+    return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
 @contextmanager
@@ -109,7 +113,7 @@ def _hardware(config: Config) -> RigParts:
     lens = _open_lens(config.lens, clock)
     try:
         camera = _open("elpd.cameras", config.camera, clock)
-        aperture = None if config.aperture.driver in {"sim", "none"} else _open_aperture(config.aperture, clock)
+        aperture = None if config.aperture.driver in {"sim", "none"} else _open_aperture(config.aperture, clock, lens)
     except BaseException:
         if isinstance(lens, Closeable):
             lens.close()
@@ -125,7 +129,7 @@ def _with_replacements(parts: RigParts, config: Config) -> RigParts:
     if config.aperture.driver == "none":
         parts = replace(parts, aperture=None)
     elif config.aperture.driver != "sim":
-        parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock))
+        parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock, parts.lens))
     return parts
 
 
@@ -149,7 +153,9 @@ def _scale(section: LensSection) -> LensScale:
     return LensScale(section.um_per_step, section.steps_to_um)
 
 
-def _open_aperture(section: DeviceSection, clock: Clock) -> Aperture:
+def _open_aperture(section: DeviceSection, clock: Clock, lens: Lens) -> Aperture:
+    if section.driver == "lens-output":
+        return aperture_on_lens(section.settings(), lens)
     aperture: Aperture = find("elpd.apertures", section.driver)(section.settings(), clock)
     return aperture
 

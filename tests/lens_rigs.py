@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +12,10 @@ from elpd_drivers.lenses import avr_wire
 from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
-from elpd_drivers.sim.lens import SimulatedLens
+from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from virtual import MonotonicClock, TestClock
 
-from elpd.units import HostNs
+from elpd.units import HostNs, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,16 +55,23 @@ class Dialect:
     ``hardest_stop_ms`` is the time from the strongest stop at full speed to rest; ``moves`` tells the command that
     starts a motion, ``lie`` makes the position at the start another one, in a reply that is right otherwise,
     ``question`` is something that an earlier session may have asked, and ``spoil`` flips a bit that a checksum guards.
+    ``homed`` opens one that an earlier session has homed; ``end_switches`` says whether the controller itself stops at
+    the ends of the travel, ``stops`` whether it can be stopped, and ``remembers`` whether it knows where it is by
+    itself. Where there is no ``lie``, no positions are reported.
     """
 
     hardest_stop_ms: float
     abrupt_keeps_reference: bool
     moves: Callable[[bytes], bool]
-    lie: Callable[[bytes], bytes]
+    lie: Callable[[bytes], bytes] | None
     question: bytes
     spoil: Callable[[bytes], bytes] | None
     settings: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    homed: dict[str, Any] = field(default_factory=dict)
+    end_switches: bool = True
+    stops: bool = True
+    remembers: bool = True
 
 
 def _flip(data: bytes) -> bytes:
@@ -89,7 +97,7 @@ DIALECTS = {
         lie=lambda data: data.replace(b"MPos:-1.500", b"MPos:-0.200"),
         question=b"?",
         spoil=None,
-        settings={"trust_position": True},
+        homed={"trust_position": True},
     ),
     "avr": Dialect(
         2.0,
@@ -127,6 +135,46 @@ DIALECTS["zaber"] = Dialect(
 )
 
 
+DIALECTS["scf4"] = Dialect(
+    3.0,
+    abrupt_keeps_reference=True,
+    moves=lambda data: data.startswith(b"G0"),
+    lie=lambda data: data.replace(b"35200,", b"32900,"),
+    question=b"!1\n",
+    spoil=None,
+    homed={"trust_position": True, "relative": "G91", "speed_scale": 7_680_000.0},
+    end_switches=False,
+)
+
+
+DIALECTS["theia"] = Dialect(
+    0.0,
+    abrupt_keeps_reference=True,
+    moves=lambda data: data[:1] in {b"\x62", b"\x66"},
+    lie=None,
+    question=b"\x76\x0d",
+    spoil=None,
+    homed={"max_speed_um_s": 4000.0, "late_ms": 200.0},
+    stops=False,
+    remembers=False,
+)
+
+
+def needs(ability: str, because: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Skip a test for the kinds whose dialect has not the *ability*, for the reason given."""
+
+    def only_where_able(test: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(test)
+        def run(kind: str, *args: Any, **kwargs: Any) -> None:
+            if not getattr(DIALECTS[kind], ability):
+                pytest.skip(because)
+            test(kind, *args, **kwargs)
+
+        return run
+
+    return only_where_able
+
+
 @dataclass
 class Rig:
     kind: str
@@ -138,9 +186,7 @@ class Rig:
     reports: list[Any] = field(default_factory=list)
 
     def open(self, **settings: Any) -> Any:
-        if self.kind == "grbl":
-            settings = {"trust_position": True, **settings}
-        self.lens = CONTROLLERS[self.kind].open_lens(settings, self.clock, self.port)
+        self.lens = CONTROLLERS[self.kind].open_lens({**self.dialect.homed, **settings}, self.clock, self.port)
         self.reports.clear()
         return self.lens
 
@@ -190,11 +236,19 @@ def _skip_what_cannot_be_built(kind: str) -> None:
         pytest.skip(hindrance)
 
 
-def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool = True, **config: Any) -> Rig:
+def rig(
+    kind: str,
+    *,
+    seed: int = 1,
+    start_um: float = 1000.0,
+    um_per_step: float = UM_PER_STEP,
+    referenced: bool = True,
+    **config: Any,
+) -> Rig:
     """Make a rig in virtual time; ``open`` connects the driver."""
     _skip_what_cannot_be_built(kind)
     clock = TestClock()
-    motor = SimulatedLens(start_um=start_um)
+    motor = SimulatedLens(LensMechanics(um_per_step=um_per_step), start_um=start_um)
     kinds = CONTROLLERS[kind].board
     board = kinds.make(motor, kinds.config(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
     port = MemoryPort(board, clock)
@@ -203,9 +257,15 @@ def rig(kind: str, *, seed: int = 1, start_um: float = 1000.0, referenced: bool 
 
 
 def open_rig(kind: str, **kwargs: Any) -> Rig:
-    """Make a rig and connect its driver."""
+    """Make a rig and connect its driver; what remembers no position is homed and brought back."""
     made = rig(kind, **kwargs)
     made.open()
+    if not made.dialect.remembers and kwargs.get("referenced", True):
+        begin = Steps(round(made.rotor))
+        made.lens.home(made.soon(10_000))
+        made.lens.move_to(begin, SPEED_SPS)
+        made.live(1000)
+        made.reports.clear()
     return made
 
 

@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 
 from elpd.calibrate.quantity import Quantity
-from elpd.vision.crossing import DARK
 from elpd.vision.pairs import Pairs, find_pairs, weighted_mode
 
 if TYPE_CHECKING:
@@ -31,6 +30,9 @@ if TYPE_CHECKING:
 
     from elpd.calibrate.evidence import Pass, Sweeps
     from elpd.records import Geometry
+
+DARK = 0.04
+"""Dark current, relative to the brightest parts of the picture: below it a photoreceptor gets no slower."""
 
 CLASSES = 6
 FEWEST_PAIRS = 150

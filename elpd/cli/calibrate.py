@@ -9,6 +9,7 @@ import click
 from elpd.cli import LazyGroup
 
 KINDS = {
+    "aperture": "transmittance against time of an opening aperture, and its delay",
     "sensor": "noise, hot pixels, thresholds, refractory period and photoreceptor lag of the camera",
 }
 

@@ -37,7 +37,7 @@ PNG = click.Path(path_type=Path, dir_okay=False)
     default="iris",
     show_default=True,
     metavar="linear|iris|FILE",
-    help="How it opens: area grows evenly (linear), diameter grows evenly (iris), or a CSV of t_us,transmittance.",
+    help="How it opens: area grows evenly (linear), diameter does (iris), CSV of t_us,transmittance, or aperture.json.",
 )
 @click.option("--size", metavar="W,H", help="The sensor's size in pixels, for files that do not say it.")
 @click.option("--out", type=PNG, help="Write the picture as 16-bit PNG, monotone in log intensity.")

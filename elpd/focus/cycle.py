@@ -319,6 +319,12 @@ class FocusCycle:
     # --- the pieces ---
 
     def _check_request(self) -> None:
+        if not self._parts.lens.capabilities.stop_on_command:
+            raise UsageError(
+                "this lens controller cannot be stopped while it moves, and a one-step focus must stop on the moment; "
+                "nothing was moved; move it to a known place (`elpd move UM`), or drive the lens by a controller that "
+                "stops: the README's table says how each does"
+            )
         geometry = self._parts.camera.geometry
         roi = self._request.roi
         if roi is not None and not roi.fits(geometry):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
-from elpd.errors import UsageError
 from elpd.focus import safety
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR
@@ -92,8 +91,6 @@ class Search:
         """
         watch = self._watch
         capabilities, limits = self._lens.capabilities, self._lens.limits
-        if not capabilities.stop_on_command:
-            raise UsageError("this lens controller cannot stop on command: it cannot focus in one sweep")
         speed_um_s = min(self._settings.speed_um_s, self._stage.to_um(limits.max_speed_sps))
         braking_um = self._braking_um(speed_um_s)
         turn_s = 2 * speed_um_s / self._stage.to_um(limits.acceleration_sps2) + capabilities.stop_onset_ms / 500.0

@@ -153,8 +153,9 @@ class Stage:
         return min(max(um, self.to_um(limits.min_steps)), self.to_um(limits.max_steps))
 
     def send(self, target_um: float, speed_um_s: float) -> None:
-        """Let the lens set out to a place."""
-        self.parts.lens.move_to(self.to_steps(target_um), speed_um_s / self.um_per_step)
+        """Let the lens set out to a place; where its steps are short, no faster than it can step."""
+        speed_sps = min(speed_um_s / self.um_per_step, self.parts.lens.limits.max_speed_sps)
+        self.parts.lens.move_to(self.to_steps(target_um), speed_sps)
 
     def travel_limit_ms(self, target_um: float, speed_um_s: float) -> float:
         """Return how long the way from here to a place may take: three times what it should, ramps allowed for."""

@@ -62,7 +62,7 @@ class Errands:
     clock, lens, scale
         The lens, what tells its time, and its ruler.
     cancelled
-        Asked every 2 ms while the lens moves; true stops it.
+        Asked every 2 ms while the lens moves; true stops it, or lets it come to rest if it cannot be stopped.
 
     """
 
@@ -152,7 +152,8 @@ class Errands:
             if heed and not cancelled and self._cancelled():
                 self._lens.stop(StopMode.RAMPED)
                 cancelled, before, asked_ns = True, None, self._clock.now_ns()
-                deadline = after_ms(asked_ns, REST_MS)
+                if self._lens.capabilities.stop_on_command:
+                    deadline = after_ms(asked_ns, REST_MS)
             report = self._lens.poll()
             if report is not None and report.earliest_ns >= asked_ns:
                 if not report.moving and before is not None and report.steps == before.steps:

@@ -35,7 +35,7 @@ def read_evidence(path: Path, rest_us: tuple[int, int] | None) -> Evidence:
     *rest_us* says between which times nothing moved. Raises ``UsageError`` where there are no events then,
     ``FormatError`` for what is no recording.
     """
-    events, geometry = _events_of(path)
+    events, geometry = events_of(path)
     missing = {
         "sweeps": ONE_WAY,
         "steps": ONE_WAY,
@@ -53,7 +53,8 @@ def read_evidence(path: Path, rest_us: tuple[int, int] | None) -> Evidence:
     return Evidence(geometry, rest, other=events, missing=missing)
 
 
-def _events_of(path: Path) -> tuple[Columns, Geometry]:
+def events_of(path: Path) -> tuple[Columns, Geometry]:
+    """Return every event of a run, a sweep or an event file, in time order. Raises ``FormatError`` for others."""
     if not is_run(path):
         sweep = read_sweep(path, frames="none")
         return Columns(sweep.t_us, sweep.x, sweep.y, sweep.on), sweep.geometry

@@ -17,6 +17,7 @@ give such pixels no weight.
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Protocol
 
 import cv2
@@ -90,7 +91,11 @@ def tabulated(t_us: NDArray[np.float64], transmittance: NDArray[np.float64]) -> 
 
 
 def read_transmittance(choice: str | Path) -> Transmittance:
-    """Return the profile named ``linear`` or ``iris``, or the one in a CSV file of ``t_us,transmittance`` rows.
+    """Return the profile named ``linear`` or ``iris``, or the one in a file.
+
+    A file holds rows of ``t_us,transmittance`` (CSV; lines with # and a heading of these words are skipped), or is
+    what `elpd calibrate aperture` stores: a JSON object whose ``kind`` is ``aperture`` and whose ``since_us`` and
+    ``transmittance`` are such columns.
 
     Raises
     ------
@@ -105,11 +110,14 @@ def read_transmittance(choice: str | Path) -> Transmittance:
         return iris
     try:
         with open(choice, encoding="utf-8") as file:  # noqa: PTH123  (choice may be str)
-            lines = [line for line in file.read().splitlines() if line.strip() and not line.startswith("#")]
+            text = file.read()
     except FileNotFoundError:
         raise UsageError(f"transmittance is linear, iris or a CSV file; there is no file {str(choice)!r}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise FormatError(f"{choice}: cannot be read as a table of t_us,transmittance ({error})") from None
+    if text.lstrip().startswith("{"):
+        return _stored_profile(choice, text)
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if lines and lines[0].replace(" ", "").lower() == "t_us,transmittance":
         del lines[0]
     rows = []
@@ -121,6 +129,22 @@ def read_transmittance(choice: str | Path) -> Transmittance:
         rows.append((t_us, transmittance))
     table = np.array(rows, np.float64).reshape(-1, 2)
     return tabulated(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+
+
+def _stored_profile(choice: str | Path, text: str) -> Transmittance:
+    try:
+        stored = json.loads(text)
+        if stored["kind"] != "aperture":
+            raise FormatError(f"{choice}: is a profile of kind {stored['kind']!r}, not of an aperture")
+        columns = [np.array(stored[name], np.float64) for name in ("since_us", "transmittance")]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{choice}: is no aperture profile ({type(error).__name__}: {error}); "
+            "make one with `elpd calibrate aperture`"
+        ) from None
+    if columns[0].ndim != 1 or columns[0].shape != columns[1].shape:
+        raise FormatError(f"{choice}: since_us and transmittance must be columns of one length")
+    return tabulated(*columns)
 
 
 def find_opening(first: FirstTimes) -> SensorUs:

@@ -8,7 +8,7 @@ import pytest
 from elpd_drivers.sim.controllers import CONTROLLERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lens_rigs import DIALECTS, KINDS, SPEED_SPS, Rig, open_rig, rig
+from lens_rigs import DIALECTS, KINDS, SPEED_SPS, Rig, needs, open_rig, rig
 
 from elpd.errors import ConfigError, LensError, UsageError
 from elpd.records import LensFlag, StopMode
@@ -66,6 +66,7 @@ def test_a_run_is_over_by_its_end_in_time_even_if_nobody_polls(kind: str) -> Non
     assert made.rotor > 3200 + 700
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_run_while_moving_the_other_way_reverses(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(2000))
@@ -77,6 +78,7 @@ def test_a_run_while_moving_the_other_way_reverses(kind: str) -> None:
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_run_can_change_its_speed(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -86,6 +88,7 @@ def test_a_run_can_change_its_speed(kind: str) -> None:
     assert made.motor.velocity_at(made.clock.now_ns()) == pytest.approx(SPEED_SPS / 4, rel=1e-3)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_ramped_stop_keeps_the_reference(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(2000))
@@ -100,6 +103,7 @@ def test_a_ramped_stop_keeps_the_reference(kind: str) -> None:
     assert made.rotor == pytest.approx(3000, abs=0.01)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_an_abrupt_stop_bites_at_once(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(2000))
@@ -115,6 +119,7 @@ def test_an_abrupt_stop_bites_at_once(kind: str) -> None:
     assert referenced == made.dialect.abrupt_keeps_reference
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_stop_overtakes_a_reversal_that_waits(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(2000))
@@ -129,6 +134,7 @@ def test_a_stop_overtakes_a_reversal_that_waits(kind: str) -> None:
     assert made.rotor == rest
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_stop_right_after_the_command_that_moves_is_not_lost(kind: str) -> None:
     for gap_ms in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0):
         made = open_rig(kind)
@@ -139,6 +145,7 @@ def test_a_stop_right_after_the_command_that_moves_is_not_lost(kind: str) -> Non
         assert not made.moving, gap_ms
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_stop_from_another_thread_wins_over_a_command_that_is_just_being_written(kind: str) -> None:
     made = open_rig(kind)
     made.live(20)
@@ -186,6 +193,7 @@ def test_replies_that_come_late_and_out_of_order_do_no_harm(kind: str) -> None:
         assert made.moving
 
 
+@needs("end_switches", "the controller has no limit switches")
 def test_the_end_stop_behind_a_false_reference_is_not_ground_against(kind: str) -> None:
     made = open_rig(kind)
     made.motor.slip(made.clock.now_ns(), 600.0)
@@ -232,6 +240,7 @@ def test_homing_finds_the_reference(kind: str) -> None:
     assert made.rotor == pytest.approx(4000, abs=2.1)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_homing_past_its_deadline_stops_and_says_so(kind: str) -> None:
     made = open_rig(kind, referenced=False)
     with pytest.raises(LensError, match="deadline"):
@@ -240,6 +249,7 @@ def test_homing_past_its_deadline_stops_and_says_so(kind: str) -> None:
     assert not made.moving
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -255,6 +265,7 @@ def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
         made.lens.run(SPEED_SPS, made.soon(100))
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_line_that_is_dead_outwards_ends_the_motion_inside_the_limits(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -279,6 +290,7 @@ def test_an_unplugged_port_is_noticed_at_once_and_the_position_is_unknown(kind: 
     made.lens.close()
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_what_was_unplugged_and_plugged_in_again_can_be_opened_and_used(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -326,6 +338,7 @@ def test_an_alarm_in_motion_is_a_fault_from_which_homing_recovers(kind: str) -> 
     assert made.rotor == pytest.approx(1000, abs=2.1)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_stop_leaves_at_once_while_a_reply_is_due(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -372,6 +385,7 @@ def test_a_board_that_restarts_in_motion_is_a_fault_and_comes_back_unreferenced(
         lens.move_to(Steps(10), SPEED_SPS)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_motor_that_ignores_stops_is_a_runaway(kind: str) -> None:
     made = open_rig(kind, ignore_stop=True)
     made.lens.run(SPEED_SPS / 4, made.soon(3000))
@@ -390,6 +404,7 @@ def test_a_few_damaged_replies_do_no_harm(kind: str) -> None:
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_nothing_but_garbage_stops_the_motor(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -401,6 +416,7 @@ def test_nothing_but_garbage_stops_the_motor(kind: str) -> None:
     assert not made.moving
 
 
+@needs("lie", "the controller reports no positions")
 def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_confirmed(kind: str) -> None:
     made = open_rig(kind)
     made.live(40)
@@ -410,6 +426,7 @@ def test_an_implausible_position_is_never_believed_and_stops_the_motor_when_conf
     assert made.rotor == 3200.0
 
 
+@needs("remembers", "the controller does not remember where it is")
 def test_what_an_earlier_session_had_asked_for_does_not_confuse_the_next(kind: str) -> None:
     made = rig(kind)
     made.port.write(made.dialect.question)
@@ -447,6 +464,7 @@ def test_unknown_and_wrong_settings_are_refused(kind: str) -> None:
         made.open(min_um=100.0, max_um=50.0)
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_closing_stops_the_motor(kind: str) -> None:
     made = open_rig(kind)
     made.lens.run(SPEED_SPS, made.soon(3000))
@@ -459,6 +477,7 @@ def test_closing_stops_the_motor(kind: str) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.binary(max_size=60))
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_any_bytes_from_the_line_end_in_a_lens_error_or_nothing(kind: str, data: bytes) -> None:
     made: Rig = open_rig(kind)
     made.lens.run(SPEED_SPS / 8, made.soon(3000))

@@ -16,7 +16,7 @@ import ticlib
 from elpd_drivers.lenses.serial_port import SerialPort
 from elpd_drivers.sim.boards.line import PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
-from lens_rigs import KINDS, SPEED_SPS, served
+from lens_rigs import DIALECTS, KINDS, SPEED_SPS, needs, served
 from virtual import MonotonicClock
 
 from elpd.errors import BusyError, ConfigError, LensError
@@ -33,7 +33,7 @@ PATIENT = {"reply_ms": 2000.0}
 
 
 def open_lens(kind: str, port: str, **settings: Any) -> Any:
-    more = {"trust_position": True, "connect_ms": 20_000.0} if kind == "grbl" else {}
+    more = {**DIALECTS[kind].homed, **({"connect_ms": 20_000.0} if kind == "grbl" else {})}
     return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more, **settings}, CLOCK, None)
 
 
@@ -59,6 +59,7 @@ def board(kind: str) -> Iterator[Any]:
     server.close()
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_lens_over_a_pty_moves_and_stops_from_another_thread(kind: str, board: Any) -> None:
     server, motor = board
     lens = open_lens(kind, server.port)
@@ -106,6 +107,7 @@ def test_unplugging_is_an_error_that_says_so(kind: str, board: Any) -> None:
     lens.close()
 
 
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_run_over_a_pty_reverses_and_ends_by_itself(kind: str, board: Any) -> None:
     if kind == "avr":
         pytest.skip("the firmware under simavr falls behind the wall clock where the machine is busy")
@@ -120,6 +122,7 @@ def test_a_run_over_a_pty_reverses_and_ends_by_itself(kind: str, board: Any) -> 
     lens.close()
 
 
+@needs("remembers", "the controller does not remember where it is")
 def test_what_comes_back_on_another_pty_can_be_opened_and_is_where_it_was(kind: str, board: Any) -> None:
     server, motor = board
     lens = open_lens(kind, server.port)
@@ -241,7 +244,7 @@ def test_elpd_sim_board_serves_grbl_with_a_plain_line() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["marlin"], "known are avr, grbl, tic, tmcl, zaber"),
+        (["marlin"], "known are avr, grbl, scf4, theia, tic, tmcl, zaber"),
         (["tic", "--set", "nope=1"], "board.nope: unknown key"),
         (["tic", "--set", "start_um"], "KEY=VALUE"),
         (["tic", "--set", "start_um=9999"], "outside the travel"),

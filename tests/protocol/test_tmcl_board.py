@@ -142,6 +142,15 @@ def test_pytrinamic_moves_it(vendor: Interface, made: Rig) -> None:
     assert made.rotor == motor.actual_position
 
 
+def test_pytrinamic_switches_the_output_that_ours_does(vendor: Interface, made: Rig) -> None:
+    vendor.set_digital_output(3)
+    assert made.board.outputs == {"out3": True}
+    vendor.clear_digital_output(3)
+    assert made.board.outputs == {"out3": False}
+    made.open().set_output("out3", on=True)
+    assert made.board.outputs == {"out3": True}
+
+
 def test_pytrinamic_lets_it_search_its_reference(vendor: Interface, made: Rig) -> None:
     for kind, value in ((5, 640_000), (193, 1), (194, 6400), (195, 400)):
         vendor.set_axis_parameter(kind, 0, value)

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import SPEED_SPS, Rig, rig, served
 from virtual import MonotonicClock
-from zaber_motion.ascii import Connection
-from zaber_motion.exceptions import CommandFailedException
+from zaber_motion.ascii import Connection, DigitalOutputAction
+from zaber_motion.exceptions import CommandFailedException, IoChannelOutOfRangeException
 
 from elpd.errors import ConfigError, LensError
 from elpd.records import LensFlag, StopMode
@@ -131,6 +131,12 @@ def axis() -> Iterator[Axis]:
         line.default_request_timeout = 20_000
         yield line.get_device(1).get_axis(1)
     server.close()
+
+
+def test_zaber_motion_speaks_of_outputs_as_ours_does(axis: Axis) -> None:
+    axis.device.io.set_digital_output(2, DigitalOutputAction.ON)
+    with pytest.raises(IoChannelOutOfRangeException):
+        axis.device.io.set_digital_output(7, DigitalOutputAction.ON)
 
 
 def test_zaber_motion_moves_it(axis: Axis) -> None:

@@ -10,6 +10,7 @@ import pytest
 from elpd_drivers.sim.scene import scene_canvas
 from scenarios import Event, SpyLens, Story, assert_invariants, play
 
+from elpd.errors import UsageError
 from elpd.focus.settings import FocusRequest
 from elpd.records import CommandStamp, Outcome, Roi
 
@@ -30,12 +31,30 @@ def picture(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("board", "start_um"),
-    [("tic", -200.0), ("tic", 200.0), ("grbl", -200.0), ("grbl", 200.0), ("tmcl", 200.0), ("zaber", -200.0)],
+    [
+        ("tic", -200.0),
+        ("tic", 200.0),
+        ("grbl", -200.0),
+        ("grbl", 200.0),
+        ("tmcl", 200.0),
+        ("zaber", -200.0),
+        ("scf4", 200.0),
+    ],
 )
 def test_focused(board: str, start_um: float) -> None:
     story = play(f"sim.board={board}", f"sim.start_um={start_um}", "sim.seed=3")
     assert story.outcome is Outcome.FOCUSED
     assert_invariants(story)
+
+
+def test_a_lens_that_cannot_be_stopped_is_refused_before_anything_happens() -> None:
+    story = play("sim.board=theia", "sim.seed=3")
+    assert isinstance(story.error, UsageError)
+    assert "cannot be stopped while it moves" in str(story.error)
+    assert "nothing was moved" in str(story.error)
+    assert not story.moved
+    assert story.phases == []
+    assert story.camera_started_ns is None
 
 
 def test_focused_on_a_stored_picture(picture: Path) -> None:

@@ -178,7 +178,13 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
         (["focus", "--config", "absent.toml"], 2, "ConfigError", "No such file"),
         (["focus", "--config", "text.txt"], 2, "ConfigError", "line 1"),
         (["focus", "--config", "typo.toml"], 2, "ConfigError", "typo.toml:2"),
-        (["focus", "--set", "lens.driver=abacus"], 2, "ConfigError", "installed: avr, grbl, tic, tmcl, zaber"),
+        (["focus", "--set", "sim.board=theia"], 2, "UsageError", "cannot be stopped while it moves"),
+        (
+            ["focus", "--set", "lens.driver=abacus"],
+            2,
+            "ConfigError",
+            "installed: avr, grbl, scf4, theia, tic, tmcl, zaber",
+        ),
         (["focus", "--set", "lens.driver=tic"], 2, "ConfigError", "lens.port is empty"),
         (["focus", "--set", "lens.driver=tic", "--set", "lens.port=absent"], 3, "LensError", "there is no such port"),
         (["focus", "--set", "lens.driver=grbl", "--set", "lens.port=text.txt"], 3, "LensError", "lens port text.txt"),
@@ -194,7 +200,7 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
         (["temporal-map", "text.txt"], 2, "FormatError", "in no format"),
         (["decode", "recording.raw", "--set", "focus.roy=1"], 2, "ConfigError", "unknown key"),
         (["replay", "text.txt"], 2, "FormatError", "run folder"),
-        (["sim-board", "abacus"], 2, "UsageError", "known are avr, grbl, tic, tmcl, zaber"),
+        (["sim-board", "abacus"], 2, "UsageError", "known are avr, grbl, scf4, theia, tic, tmcl, zaber"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

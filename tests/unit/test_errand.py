@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from command_line import Answer, caller
-from lens_rigs import KINDS, UM_PER_STEP, Rig, open_rig
+from lens_rigs import KINDS, UM_PER_STEP, Rig, needs, open_rig
 
 from elpd.errors import LensError, UsageError
 from elpd.motion.errand import Errands
@@ -60,6 +60,7 @@ def test_homing_gives_a_reference_and_its_deadline_is_kept(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@needs("stops", "the controller cannot be stopped while it moves")
 def test_an_errand_that_is_cancelled_stops_on_its_way(kind: str) -> None:
     rig = open_rig(kind)
     from_ns = rig.clock.now_ns()
@@ -68,6 +69,16 @@ def test_an_errand_that_is_cancelled_stops_on_its_way(kind: str) -> None:
     assert not rig.moving
     assert 1010.0 < arrival.um < 1900.0
     assert arrival.steps == pytest.approx(rig.rotor, abs=1e-3)
+
+
+def test_an_errand_that_is_cancelled_waits_for_what_cannot_be_stopped() -> None:
+    rig = open_rig("theia")
+    from_ns = rig.clock.now_ns()
+    arrival = errands(rig, lambda: rig.clock.now_ns() > from_ns + 30_000_000).move_to(2400.0, 640.0)
+    assert arrival.cancelled
+    assert arrival.duration_ms > 1900.0, "longer than a lens that stops is waited for"
+    assert not rig.moving
+    assert arrival.um == 2400.0
 
 
 def test_stop_says_where_and_may_be_asked_twice() -> None:

@@ -137,7 +137,7 @@ def test_the_davis_has_frames_and_arrays_and_no_aperture() -> None:
     assert frames == 3
 
 
-@pytest.mark.parametrize("board", ["tic", "grbl", "tmcl", "zaber"])
+@pytest.mark.parametrize("board", ["tic", "grbl", "tmcl", "scf4", "theia", "zaber"])
 def test_every_board_turns_the_lens(board: str) -> None:
     rig = build_rig(SMALL | {"seed": 1, "board": board})
     truth = _truth(rig)
@@ -153,7 +153,7 @@ def test_every_board_turns_the_lens(board: str) -> None:
         ({"scene": "moon"}, r"sim\.scene is 'moon'"),
         ({"motion": "wobble"}, r"sim\.motion is 'wobble'"),
         ({"camera": "evk9"}, r"sim\.camera is 'evk9'; known: evk4, davis346"),
-        ({"board": "abacus"}, r"sim\.board is 'abacus'; known: tic, grbl, avr, tmcl, zaber"),
+        ({"board": "abacus"}, r"sim\.board is 'abacus'; known: tic, grbl, avr, tmcl, scf4, theia, zaber"),
         ({"width": 2000}, r"sim\.width, sim\.height are 2000, 720"),
         ({"start_um": 2400.0}, r"sim\.start_um is 2400, too far"),
         ({"brightness": 0.0}, r"sim\.brightness"),

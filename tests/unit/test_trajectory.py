@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lens_rigs import KINDS, SPEED_SPS, UM_PER_STEP, rig
+from lens_rigs import KINDS, SPEED_SPS, UM_PER_STEP, needs, rig
 
 from elpd.errors import LensError
 from elpd.motion.kinematics import Piece, approach, in_segments, lay_out, ramp, state_at
@@ -138,6 +138,7 @@ def test_the_same_calls_give_the_same_bits() -> None:
         ("grbl", 1.0, 0.4, 0.6),
         ("tmcl", 0.4, 0.3, 0.1),
         ("zaber", 0.4, 0.3, 0.1),
+        ("scf4", 0.4, 0.4, 0.1),
         ("avr", 0.7, 0.6, 0.1),
     ],
 )
@@ -194,6 +195,7 @@ def test_the_truth_lies_within_two_sigma(kind: str, live_rms_um: float, late_rms
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@needs("stops", "the controller takes no command while it moves; test_theia_board has its moves")
 def test_it_stays_honest_under_any_commands(kind: str) -> None:
     covered: list[bool] = []
     for seed in range(5):

@@ -27,7 +27,7 @@ from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
@@ -42,6 +42,8 @@ SETTLING_SPS = 2000.0
 START_STEPS, TURN_STEPS = 2.0, 6.0
 """How far its ramps lag behind the ideal, from rest and through rest: their first steps are single ones. One standard
 deviation, seen on the firmware; reports soon tell how far it truly is."""
+
+OUTPUTS = ("iris",)
 
 TRIES = 3
 """How often a command is sent before its silence is a fault."""
@@ -123,6 +125,7 @@ class AvrController:
         self._flags = 0
         self._stamp: int | None = None
         self._homing_begun = False
+        self._iris: tuple[bool, int] | None = None  # what it was told to be and is not known to be, tries
         self._unconfirmed: tuple[int, bytes, int, int] | None = None  # sequence, frame, stops before it, tries
 
     @property
@@ -223,6 +226,35 @@ class AvrController:
             self._motor.referenced = False
         return 0
 
+    # --- the iris --------------------------------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The iris output."""
+        return OUTPUTS
+
+    def switch(self, name: str, *, on: bool) -> Sent:
+        """Open or close the iris; the reports say whether that was obeyed, and it is said again if not."""
+        del name
+        self._iris = (on, 1)
+        return self._send_iris(on=on)
+
+    def _send_iris(self, *, on: bool) -> Sent:
+        return self._line.send(wire.encode(self._next(), wire.IRIS, bytes((int(on),))))
+
+    def _watch_iris(self, flags: int) -> None:
+        """See in a report's flags that the iris was obeyed; saying it twice is as good as once."""
+        if self._iris is None:
+            return
+        on, tries = self._iris
+        if bool(flags & wire.IRIS_OPEN) == on:
+            self._iris = None
+        elif tries > TRIES:
+            raise Trouble(f"the iris output does not obey, {tries} times told; check the cable and the firmware")
+        else:
+            self._iris = (on, tries + 1)
+            self._send_iris(on=on)
+
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def begin_homing(self) -> None:
@@ -275,6 +307,7 @@ class AvrController:
                 continue
             self._watch_restart(reply)
             self._flags = reply.flags
+            self._watch_iris(reply.flags)
             reading = self._reading(reply, now_ns)
         return reading
 

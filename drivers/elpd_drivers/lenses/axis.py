@@ -14,7 +14,7 @@ from elpd.records import LensLimits
 from elpd.units import NS_PER_S, Steps
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 T = TypeVar("T")
 
@@ -75,6 +75,12 @@ def check_target(target: int, limits: LensLimits) -> None:
             f"lens: target {target} steps is outside the travel of {limits.min_steps}..{limits.max_steps}; "
             "choose one inside, or widen lens.min_um or lens.max_um if the lens can go there"
         )
+
+
+def check_output(name: str, outputs: Sequence[str]) -> None:
+    """Refuse an output that the controller does not have. Raises ``UsageError``."""
+    if name not in outputs:
+        raise UsageError(f"lens: no output is called {name!r}; this controller has {', '.join(outputs)}")
 
 
 def run_target(

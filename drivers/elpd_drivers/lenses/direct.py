@@ -13,13 +13,13 @@ from __future__ import annotations
 import math
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from elpd.errors import LensError
+from elpd.errors import LensError, UsageError
 from elpd.motion.trajectory import REST, Motion
 from elpd.records import CommandStamp, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
-from elpd_drivers.lenses.axis import check_speed, check_target, run_target
+from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target
 from elpd_drivers.lenses.line import Trouble
 
 if TYPE_CHECKING:
@@ -145,6 +145,20 @@ class Controller(Protocol):
         ...
 
 
+@runtime_checkable
+class Switching(Protocol):
+    """A controller with outputs of its own."""
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The outputs' names."""
+        ...
+
+    def switch(self, name: str, *, on: bool) -> Sent:
+        """Switch one of them, behind nothing that moves the motor. Raises ``Trouble`` if it is refused."""
+        ...
+
+
 class DirectLens:
     """``elpd.ports.Lens`` on a controller that obeys at once.
 
@@ -253,6 +267,21 @@ class DirectLens:
         with self._guarded():
             report = self._poll(fuse=True)
             return None if report is None else self._flagged(report)
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """What the controller can switch beside the motor."""
+        return self._controller.outputs if isinstance(self._controller, Switching) else ()
+
+    def set_output(self, name: str, *, on: bool) -> CommandStamp:
+        """Switch one of the controller's outputs."""
+        controller = self._controller
+        if not isinstance(controller, Switching):
+            raise UsageError("lens: this controller has no outputs that it can be told to switch")
+        check_output(name, controller.outputs)
+        with self._guarded():
+            sent = controller.switch(name, on=on)
+        return CommandStamp(f"{name} {'on' if on else 'off'}", sent.begun_ns, sent.done_ns)
 
     def position_at(self, when: HostNs) -> PositionEstimate:
         """Return where the motor was at *when*."""

@@ -24,12 +24,13 @@ from elpd.motion.trajectory import REST, Motion, Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.asking import Asking
-from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, run_target
+from elpd_drivers.lenses.axis import check_output, check_speed, check_target, limits_from, run_target
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import (
     ALARM_WORDS,
     CANCEL,
     ERROR_WORDS,
+    OUTPUTS,
     RESET,
     STATUS,
     Status,
@@ -41,7 +42,7 @@ from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensLimits, PositionEstimate
@@ -155,6 +156,21 @@ class GrblLens:
             report = self._poll(fuse=True)
             self._take_next_step()
             return None if report is None else self._flagged(report)
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """What GRBL can switch beside the motor."""
+        return tuple(OUTPUTS)
+
+    def set_output(self, name: str, *, on: bool) -> CommandStamp:
+        """Switch an output. At rest only: in motion the line would wait behind the jog, or be refused."""
+        check_output(name, self.outputs)
+        with self._guarded():
+            if self._busy() or (self._status is not None and self._status.state != "Idle"):
+                raise LensError(f"lens: GRBL switches {name} at rest only; wait until the motor stands, home if locked")
+            self._unacknowledged.append(None)
+            sent = self._line.send(OUTPUTS[name][0 if on else 1])
+        return CommandStamp(f"{name} {'on' if on else 'off'}", sent.begun_ns, sent.done_ns)
 
     def position_at(self, when: HostNs) -> PositionEstimate:
         """Return where the motor was at *when*."""

@@ -28,6 +28,13 @@ ALARM_WORDS = {
     "8": "homing could not leave the switch",
     "9": "homing did not find the switch",
 }
+OUTPUTS = {
+    "coolant": (b"M8\n", b"M9\n"),
+    "spindle": (b"M3S1000\n", b"M5\n"),
+    "iris": (b"M114P1\n", b"M114P0\n"),
+}
+"""What switches an output on and off. The iris is Kurokesu's SCE2's; other boards refuse it (error 20)."""
+
 _STATE = re.compile(r"<(Idle|Jog|Run|Hold:[01]|Alarm|Home|Door:[0-3]|Check|Sleep)\|")
 _POSITION = re.compile(r"\|MPos:(-?\d+\.\d{3,4}),[-\d.,]+[|>]")
 _PINS = re.compile(r"\|Pn:([A-Z]+)[|>]")

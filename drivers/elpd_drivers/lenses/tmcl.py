@@ -30,13 +30,14 @@ from elpd_drivers.lenses.motor import Motor
 from elpd_drivers.lenses.tmcl_talk import LOOK_MS, Talk, TmclSettings, identify, learn_units, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
     from elpd_drivers.lenses.line import Line, Sent
 
 REFERENCED_MARK, MARK_VARIABLE = 0x454C_5044, 55
+OUTPUTS = tuple(f"out{port}" for port in range(8))
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> DirectLens:
@@ -219,6 +220,21 @@ class TmclController:
             half_ns = (sent.off_wire_ns - self._stop_first_ns) // 2
             effective_ns = self._stop_first_ns + half_ns + self._latency.usual_ns
             self._motor.amend(self._motor.newest_command, effective_ns, half_ns)
+
+    # --- outputs ---------------------------------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The module's general purpose outputs; it refuses those that it does not have."""
+        return OUTPUTS
+
+    def switch(self, name: str, *, on: bool) -> Sent:
+        """Switch an output, and wait for the reply: no other command may be sent before it."""
+        self._settle()
+        port = int(name.removeprefix("out"))
+        sent = self._line.send(self._talk.frame(wire.SIO, port, int(on), motor=wire.OUTPUT_BANK))
+        self._talk.confirm(wire.SIO)
+        return sent
 
     # --- homing ----------------------------------------------------------------------------------------------------
 

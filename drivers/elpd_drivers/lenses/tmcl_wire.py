@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 
 FRAME = 9
-ROR, ROL, MST, MVP, SAP, GAP, SGP, GGP, RFS, GET_VERSION = 1, 2, 3, 4, 5, 6, 9, 10, 13, 136
+ROR, ROL, MST, MVP, SAP, GAP, SGP, GGP, RFS, SIO, GET_VERSION = 1, 2, 3, 4, 5, 6, 9, 10, 13, 14, 136
 ABSOLUTE = 0
 START, STOP, STATUS = 0, 1, 2
 OK = 100
@@ -31,6 +31,8 @@ DRIVER_FLAGS = 208
 SEARCH_LEFT_SWITCH = 1
 DRIVER_WORDS = {2: "too hot", 8: "short circuit of phase A", 16: "short circuit of phase B"}
 USER_BANK = 2
+OUTPUT_BANK = 2
+"""Of ports; SIO takes it where others take the motor."""
 
 TMC429_HZ = 16_000_000
 TMC429_MAX = 2047

@@ -29,7 +29,7 @@ from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 IDENTIFICATIONS = 3
 OLDEST = (7, 25)
 LONGEST_COMMAND = 40
+OUTPUTS = ("do1", "do2", "do3", "do4")
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,6 +273,20 @@ class ZaberController:
         if mode is StopMode.ABRUPT and speed_sps > 0.0:
             self._motor.referenced = False
         return 0
+
+    # --- outputs ---------------------------------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The digital outputs; a device without them, or with fewer, refuses."""
+        return OUTPUTS
+
+    def switch(self, name: str, *, on: bool) -> Sent:
+        """Switch a digital output of the device: one command, whose reply ``read`` looks at."""
+        number = self._next_number()
+        self._orders.add(number)
+        words = f"io set do {name.removeprefix('do')} {int(on)}"
+        return self._line.send(wire.command(self._settings.device, 0, words, number))
 
     # --- homing ----------------------------------------------------------------------------------------------------
 

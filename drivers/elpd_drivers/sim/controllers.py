@@ -10,10 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError
-from elpd_drivers.lenses import avr, avr_wire, grbl, tic, tmcl, zaber
+from elpd_drivers.lenses import avr, avr_wire, grbl, scf4, scf4_wire, theia, tic, tmcl, zaber
 from elpd_drivers.sim.boards.avr import BOARD as AVR
 from elpd_drivers.sim.boards.grbl import BOARD as GRBL
 from elpd_drivers.sim.boards.line import MemoryPort
+from elpd_drivers.sim.boards.scf4 import BOARD as SCF4
+from elpd_drivers.sim.boards.scf4 import Scf4Config
+from elpd_drivers.sim.boards.theia import BOARD as THEIA
 from elpd_drivers.sim.boards.tic import BOARD as TIC
 from elpd_drivers.sim.boards.tmcl import BOARD as TMCL
 from elpd_drivers.sim.boards.zaber import BOARD as ZABER
@@ -77,6 +80,29 @@ def _set_up(wanted: Wanted) -> Table:
     return {"speed_um_s": wanted.speed_um_s, "acceleration_um_s2": wanted.acceleration_um_s2}
 
 
+def _without_ramps(wanted: Wanted) -> Table:
+    """Return the table of a driver whose controller starts and stops at full speed."""
+    table = _told_by_driver(wanted)
+    del table["acceleration_um_s2"]
+    return table
+
+
+_SCF4_AS_MADE = Scf4Config()
+
+
+def _homed_scf4(wanted: Wanted) -> Table:
+    """Return the table of an SCF4 that an earlier session has homed, so that it knows how its board counts."""
+    fastest = scf4_wire.FASTEST_CODE
+    return {
+        "um_per_step": wanted.um_per_step,
+        "max_um": wanted.travel_um,
+        "max_speed_um_s": min(wanted.speed_um_s, _SCF4_AS_MADE.speed_scale / fastest * wanted.um_per_step),
+        "trust_position": True,
+        "relative": _SCF4_AS_MADE.relative,
+        "speed_scale": _SCF4_AS_MADE.speed_scale,
+    }
+
+
 CONTROLLERS: Mapping[str, Controller] = {
     "tic": Controller(TIC, tic.open_lens, _nothing, _told_by_driver),
     "grbl": Controller(
@@ -84,6 +110,8 @@ CONTROLLERS: Mapping[str, Controller] = {
     ),
     "avr": Controller(AVR, avr.open_lens, _nothing, _told_within(avr_wire.FASTEST_SPS)),
     "tmcl": Controller(TMCL, tmcl.open_lens, _nothing, _told_by_driver),
+    "scf4": Controller(SCF4, scf4.open_lens, _nothing, _homed_scf4),
+    "theia": Controller(THEIA, theia.open_lens, _nothing, _without_ramps),
     "zaber": Controller(ZABER, zaber.open_lens, _set_up, lambda wanted: {"um_per_step": wanted.um_per_step}),
 }
 

@@ -152,6 +152,11 @@ class AvrBoard:
         return int(self._bench.bench_sync_edges(self._handle))
 
     @property
+    def outputs(self) -> dict[str, bool]:
+        """The output that can be switched, by name."""
+        return {"iris": self.iris_open}
+
+    @property
     def iris_open(self) -> bool:
         """The state of the IRIS pin."""
         return bool(self._bench.bench_iris(self._handle))

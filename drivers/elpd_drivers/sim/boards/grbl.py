@@ -121,6 +121,8 @@ class GrblBoard:
         self._motion: _Motion | None = None
         self._state = "Idle"
         self._held = self._silent = False
+        self.outputs: dict[str, bool] = {}
+        """The outputs that were switched, by name: for tests."""
         self._homing: list[Callable[[int], None]] = []
         self._homing_due_ns: int | None = None
         self._switch_ns: int | None = None
@@ -319,6 +321,10 @@ class GrblBoard:
         self._plan(target, asked.feed_mm_min, at_ns, jog=True)
 
     def _gcode(self, line: str, at_ns: int) -> None:
+        if line in text.OUTPUT_WORDS:
+            name, on = text.OUTPUT_WORDS[line]
+            self.outputs[name] = on
+            return
         asked = text.parse_motion(line, jog=False)
         self._relative = self._relative if asked.relative is None else asked.relative
         self._mode = self._mode if asked.mode is None else asked.mode

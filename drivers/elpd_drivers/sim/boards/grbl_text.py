@@ -94,6 +94,14 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
+OUTPUT_WORDS = {
+    "M8": ("coolant", True),
+    "M9": ("coolant", False),
+    "M3S1000": ("spindle", True),
+    "M5": ("spindle", False),
+}
+
+
 def parse_motion(line: str, *, jog: bool) -> MotionWords:
     """Read the words of a motion line (spaces and case already removed). Raises ``GrblError``."""
     x_mm = relative = feed = mode = None

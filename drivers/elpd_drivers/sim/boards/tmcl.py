@@ -345,6 +345,11 @@ class TmclBoard:
         self._ports[asked.kind] = asked.value
         return asked.value
 
+    @property
+    def outputs(self) -> dict[str, bool]:
+        """The outputs that were switched, by name: for tests."""
+        return {f"out{port}": value != 0 for port, value in self._ports.items()}
+
     def _get_port(self, asked: Datagram, at_ns: int) -> int | Status:
         del at_ns
         if asked.bank > 2 or asked.kind > 7:

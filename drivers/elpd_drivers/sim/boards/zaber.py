@@ -78,6 +78,8 @@ class ZaberBoard:
         self._partial = bytearray()
         self._output: list[tuple[int, bytes]] = []
         self._flags: set[str] = set()
+        self.outputs: dict[str, bool] = {}
+        """The digital outputs that were switched, by name: for tests."""
         self._settings: dict[str, float | str] = {}
         self._power_up(begin_ns, referenced=self.config.referenced)
 
@@ -183,6 +185,8 @@ class ZaberBoard:
                 return self._stop(at_ns, abrupt=True)
             case ["warnings", *clear] if clear in ([], ["clear"]):
                 return self._warnings(clear=bool(clear))
+            case ["io", "set", "do", port, "0" | "1" as level]:
+                return self._switch(port, level)
             case ["driver", "disable" | "enable" as which]:
                 return self._driver(at_ns, on=which == "enable")
         raise RefusedError("BADCOMMAND")
@@ -237,6 +241,12 @@ class ZaberBoard:
             self._flags |= {"FO", "WR"}
             self._axis.halt(at_ns)
             self._watch_limits()
+        return "0"
+
+    def _switch(self, port: str, level: str) -> str:
+        if port not in {"1", "2", "3", "4"}:
+            raise RefusedError("BADDATA")
+        self.outputs[f"do{port}"] = level == "1"
         return "0"
 
     def _home(self, at_ns: int) -> str:
