@@ -51,7 +51,7 @@ def test_where_one_pass_is_enough_no_second_is_made() -> None:
 
 
 def test_the_second_pass_leads_over_focus_in_the_direction_of_the_sweep() -> None:
-    story = shown("violent", 2)  # in the first the scene rests while the sensor is listened to
+    story = shown("violent", 2)  # of the first the sensor at rest sees no motion
     begun = next(fields for fields in story.named("phase") if fields["name"] == "recross")
     assert story.result is not None
     sign = story.result.details["sweep_sign"]
