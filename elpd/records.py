@@ -274,6 +274,7 @@ class Phase(Enum):
     PROBE = "probe"
     SWEEP = "sweep"
     STOP = "stop"
+    RECROSS = "recross"
     RETURN = "return"
     VERIFY = "verify"
     DONE = "done"

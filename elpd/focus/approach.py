@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from elpd.focus import safety
 from elpd.focus.ended import Ended
+from elpd.focus.stage import REST_LIMIT_MS
 from elpd.records import Outcome
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, after_ms
 
@@ -122,6 +123,25 @@ class WayBack:
         times = range(turning_ns, after_ms(turning_ns, TURN_MS), NS_PER_MS // 4)
         lowest = min(self._sign * lens.position_at(HostNs(when)).steps for when in times)
         return self._stage.to_um(self._sign * lowest)
+
+
+def come_to_rest(stage: Stage, watch: Watch, stop: CommandStamp, way: WayBack, sign: int) -> Standstill:
+    """See the sweep to its end; return where and when that was.
+
+    A controller that stops on the next step is told at once to go back to about where focus was: the events of the
+    last step, and what is computed from them, arrive while it goes.
+    """
+    capabilities = stage.parts.lens.capabilities
+    ended_ns = after_ms(stop.done_ns, capabilities.stop_onset_ms)
+    watch.turn(stage.sensor_clock.to_sensor(ended_ns))
+    if capabilities.abrupt_stop and capabilities.native_velocity:
+        way.set_out(watch.roughly_um)
+        watch.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
+        stage.hear(safety.CAMERA_SILENCE_MS)
+    else:
+        stage.rest(REST_LIMIT_MS)
+        watch.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
+    return standstill(stage, watch, stop, sign)
 
 
 def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport, focus_um: float) -> int:

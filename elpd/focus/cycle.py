@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
-from elpd.focus import guards, safety
-from elpd.focus.approach import AFTERGLOW_MS, WayBack, standstill, verify
+from elpd.focus import guards, judging, safety, second_pass
+from elpd.focus.approach import WayBack, come_to_rest, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
 from elpd.focus.picture import Picture
@@ -162,9 +162,15 @@ class FocusCycle:
         passed = self._search(watch)
         self._phase(Phase.STOP)
         sign = self._details["sweep_sign"]
+        assert passed.stop is not None, "a sweep that has passed focus sent its stop"
         way = WayBack(self._stage, self._settings, sign)
-        stop_um = self._come_to_rest(watch, passed, way, sign)
-        estimate = self._judge(watch, sign, passed.begun_um, stop_um)
+        ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
+        self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
+        first, furthest_um = watch.estimate(), ended.um
+        if second_pass.is_needed(watch):
+            first, furthest_um = self._pass_again(watch, first, sign)
+            way = WayBack(self._stage, self._settings, sign)
+        estimate = self._judge(watch, first, sign, (passed.begun_um, furthest_um))
         self._phase(Phase.RETURN)
         rest = way.arrive(estimate.focus_um)
         self._phase(Phase.VERIFY)
@@ -283,30 +289,19 @@ class FocusCycle:
             self._reversals = search.reversals
             self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
-    def _come_to_rest(self, watch: Watch, passed: SweepReport, way: WayBack, sign: int) -> float:
-        """See the sweep to its end; return where that was.
+    def _pass_again(self, watch: Watch, first: FocusEstimate | None, sign: int) -> tuple[FocusEstimate | None, float]:
+        """Pass focus a second time; return what both passes say and where the lens is then."""
+        self._phase(Phase.RECROSS)
+        limit_um = judging.limit_um(self._settings)
+        focus_um, sigma_um = (watch.peak_um, limit_um) if first is None else (first.focus_um, first.sigma_um)
+        self._sink.note("one pass", focus_um=focus_um, sigma_um=None if first is None else sigma_um)
+        rest = second_pass.pass_again(self._stage, watch, self._settings, focus_um, sigma_um, sign)
+        return watch.estimate(), self._stage.to_um(rest.steps)
 
-        A controller that stops on the next step is told at once to go back to about where focus was: the events of the
-        last step, and what is computed from them, arrive while it goes.
-        """
-        assert passed.stop is not None, "a sweep that has passed focus sent its stop"
-        stage, capabilities = self._stage, self._parts.lens.capabilities
-        ended_ns = after_ms(passed.stop.done_ns, capabilities.stop_onset_ms)
-        watch.turn(stage.sensor_clock.to_sensor(ended_ns))
-        if capabilities.abrupt_stop and capabilities.native_velocity:
-            way.set_out(watch.roughly_um)
-            watch.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
-            stage.hear(safety.CAMERA_SILENCE_MS)
-        else:
-            stage.rest(REST_LIMIT_MS)
-            watch.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
-        ended = standstill(stage, watch, passed.stop, sign)
-        self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
-        return ended.um
-
-    def _judge(self, watch: Watch, sign: int, begun_um: float, stop_um: float) -> FocusEstimate:
-        """Say where focus was, and refuse an answer that the evidence does not carry."""
-        estimate = watch.estimate()
+    def _judge(
+        self, watch: Watch, estimate: FocusEstimate | None, sign: int, way_um: tuple[float, float]
+    ) -> FocusEstimate:
+        """Note what is known of focus, and refuse an answer that the evidence does not carry."""
         if estimate is None:
             raise Ended(
                 Outcome.LOW_CONFIDENCE,
@@ -317,25 +312,8 @@ class FocusCycle:
         self._details["method"] = estimate.method
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
-        if watch.gap_near_crossing:
-            raise Ended(
-                Outcome.EVENTS_LOST,
-                f"events were lost while focus was passed ({self._stage.lost_events} known); "
-                "choose a smaller ROI or a slower sweep",
-            )
-        limit_um = self._settings.max_sigma_dof * self._settings.depth_of_focus_um
-        if estimate.sigma_um > limit_um:
-            raise Ended(
-                Outcome.LOW_CONFIDENCE,
-                f"focus is known to {estimate.sigma_um:.1f} um only (limit {limit_um:.1f}); "
-                "choose a ROI with more contrast, more light, or less motion",
-            )
-        if sign * (estimate.focus_um - stop_um) > self._settings.depth_of_focus_um:
-            raise Ended(
-                Outcome.LOW_CONFIDENCE,
-                f"focus was put at {estimate.focus_um:.1f} um, which the sweep ({begun_um:.1f} to "
-                f"{stop_um:.1f}) has not reached",
-            )
+        lost = self._stage.lost_events if watch.gap_near_crossing else None
+        judging.demand(estimate, self._settings, sign, way_um, lost)
         return estimate
 
     # --- the pieces ---

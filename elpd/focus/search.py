@@ -156,6 +156,7 @@ class Search:
                 )
             turned_at_um = self._stage.here_um() if report.end is SweepEnd.BEHIND else None
             if report.end is SweepEnd.RULE:
+                self._stage.listener = watch.follow
                 self._stage.rest(REST_LIMIT_MS)
             self.reversals += 1
             reach_um = self._settings.max_travel_um + abs(self._stage.here_um() - report.begun_um) + 2 * braking_um

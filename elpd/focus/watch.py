@@ -10,44 +10,32 @@ was.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from elpd.events.stream import PacketDecoder
-from elpd.records import Direction, ElpSample
+from elpd.focus.frame_track import FrameTrack
+from elpd.focus.heading import Heading
+from elpd.focus.lamplight import Lamplight, weighed
+from elpd.focus.passes import Pass, Passes
+from elpd.focus.placed import Placed
+from elpd.records import Direction
 from elpd.units import SensorUs
-from elpd.vision.crossing import (
-    DARK,
-    DARK_OF_MAP,
-    ROI_MARGIN_PX,
-    WIDTHS_PER_DEPTH_OF_FOCUS,
-    Witness,
-    frame_witness,
-    fuse,
-    lamp_witness,
-)
-from elpd.vision.detector import Detector, RestingRate
+from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
+from elpd.vision.detector import RestingRate
 from elpd.vision.elp import ElpWindows
-from elpd.vision.memory import EventMemory
+from elpd.vision.memory import BuiltImage, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
 from elpd.vision.resting import Resting
-from elpd.vision.ruler import Ruler
 from elpd.vision.saturation import RateWatch
-from elpd.vision.track import RISE, FrameEnergy, PeakTrack
-from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
-    from elpd.records import CameraPacket, FocusEstimate, Frame, Geometry, Roi, SensorProfile
+    from elpd.records import CameraPacket, ElpSample, FocusEstimate, Frame, Geometry, Roi, SensorProfile
     from elpd.vision.flicker import Flicker
     from elpd.vision.reference import Reference
-
-PATH_STEP_US = 250
-"""The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
 
 LOOK_BACK_DOF = 12.0
 """Losses this far back from the decision count against it: the witnesses look no further."""
@@ -70,12 +58,6 @@ FOR_EVER = SensorUs(1 << 62)
 LAG_UNEXPLAINED_LIVE = 0.3
 """Share of the lag correction that may be wrong where the picture that says which pixels are slow is a temporal map,
 taken without saturation, or the newest frame: neither is as blurred as the first frame of a record."""
-
-SIGMAS_OF_PROBE = 5.0
-"""What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
-
-SIGMAS_AFTER_REVERSAL = 9.0
-"""A false reversal costs the most: the second needs this many standard deviations."""
 
 SLOW_SHARE = 0.2
 """Windows with less than this share of the planned travel say little: the lens starts, stops or turns."""
@@ -147,11 +129,10 @@ class Watch:
         """What the sensor says at rest."""
         self.rate = RateWatch()
         """Whether the read-out is full."""
-        self._lamp: Flicker | None = None
-        self._periods: WholePeriods | None = None
+        self._lamp: Lamplight | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
-        self._detector = Detector()
+        self._heading = Heading(self._rest)
         self._decoder = PacketDecoder(geometry)
         self._memory = EventMemory(roi, geometry, sensor=sensor)
         self._ticked_um = self._here_um = float("nan")
@@ -159,12 +140,14 @@ class Watch:
         self._gaps_us: list[int] = []
         self._last_us = SensorUs(0)
         self._turned_us = FOR_EVER
-        self._located_last = (SensorUs(-1), 0.0)
+        self._placed = Placed(locate)
         self._sign = 1
         self._begun_us = SensorUs(0)
         self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
-        self._forget_frames()
+        self._frames = FrameTrack(self.roi, follow=self.scene_moves)
+        self._passes = Passes()
+        self._unheard: list[CameraPacket] = []
         self.decided_us: SensorUs | None = None
         """When the window that decided was complete, on the sensor's clock."""
         self.events = 0
@@ -185,6 +168,7 @@ class Watch:
         """Learn from a packet of a sensor that sees nothing move."""
         events = self._decoder.feed(packet)
         self.resting.add(events.t, events.x, events.y, events.p, packet.complete_until_us)
+        self.resting.see(packet.frames)
 
     def armed(self) -> None:
         """Close the lesson of the resting sensor: its rate is known, and hot pixels are not listened to any more."""
@@ -193,7 +177,7 @@ class Watch:
 
     def under_a_lamp(self, lamp: Flicker, speed_um_s: float) -> None:
         """Judge only whole periods of a lamp that flickers, of a sweep that is slow enough for them."""
-        self._lamp = lamp
+        self._lamp = Lamplight(self.resting.heard & ~self.resting.hot)
         self._settings = replace(self._settings, speed_um_s=speed_um_s)
         shortest_us = 1e6 * TRAVEL_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um / speed_um_s
         self._window_us = round(lamp.period_us * np.ceil(shortest_us / lamp.period_us))
@@ -204,9 +188,19 @@ class Watch:
         return self._lamp is not None
 
     @property
+    def scene_moves(self) -> bool:
+        """Whether the scene moved while the lens stood still."""
+        return self.resting.moves
+
+    @property
+    def frame_period_us(self) -> float | None:
+        """Time from one frame to the next, as seen so far; ``None`` if there were not two."""
+        return self._frames.period_us(self.resting.frame_times_us)
+
+    @property
     def resting_rate_hz(self) -> float:
-        """Events per second that the region sends at rest."""
-        return 1e6 * self._rest.events_per_us
+        """Events per second that noise makes in the region: what it sends at rest, unless the scene moved."""
+        return 0.0 if self.scene_moves else 1e6 * self._rest.events_per_us
 
     @property
     def resting_events(self) -> int:
@@ -220,23 +214,23 @@ class Watch:
         the way out (photoreceptors lag, comparators have hysteresis) than about the way back, and are not judged; and
         the verdict that led here was certain, so the opposite one must be more certain still.
         """
-        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, sensor=self._sensor)
+        self._remember(self.resting.image_at_start if self._windows is None else self._memory.built())
         if self._lamp is not None:
-            self._periods = WholePeriods(self.resting.heard & ~self.resting.hot, at_us)
-            self._undone = np.zeros(self._inside.shape, np.int32)
+            self._lamp.begin(at_us)
         self._ticked_um = self._here_um = float("nan")
         self._passed = False
         if self._windows is None:
             self._windows = ElpWindows(self._reference.weights, self._inside, window_us=self._window_us, rate_cap=True)
-        self._detector = Detector(
-            self._rest, recede_sigmas=SIGMAS_OF_PROBE if turned_at_um is None else SIGMAS_AFTER_REVERSAL
+        self._heading = Heading.of_sweep(
+            self._rest, self._memory, again=turned_at_um is not None, scene_moves=self.scene_moves
         )
         self._sign = sign
         self._judge_from = float("-inf") if turned_at_um is None else sign * turned_at_um
         self._begun_us = at_us
         self._samples = []
-        self._forget_frames()
+        self._frames = FrameTrack(self.roi, follow=self.scene_moves)
         self._gaps_us = []
+        self._passes, self._unheard = Passes(), []
         self.decided_us = None
         self._turned_us = FOR_EVER
         self.events = 0
@@ -248,18 +242,17 @@ class Watch:
         samples = []
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
             duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
-            self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
+            ticked = self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
-            self._detector.feed(sample)
-            seen = self._detector.direction is Direction.APPROACHING or self._detector.mutation is not None
-            if seen and not self._passed and self._memory.peak_passed:
+            self._heading.feed(sample, self._memory, ticked=ticked)
+            if self._heading.seen_ahead and not self._passed and self._memory.peak_passed:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
@@ -276,12 +269,11 @@ class Watch:
             self._gaps_us.append(int(self._last_us))
         events = self._decoder.feed(packet)
         self.rate.add(events.t)
-        if self._periods is not None:
-            self._periods.add(events.t, events.x, events.y, events.p)
+        if self._lamp is not None:
+            self._lamp.add(events)
             return
-        first, last = np.searchsorted(events.t, [self._begun_us, self._turned_us], side="left")
-        part = slice(int(first), int(last))
-        self._memory.add(events.t[part], events.x[part], events.y[part], events.p[part])
+        first = int(np.searchsorted(events.t, self._begun_us, side="left"))
+        self._memory.add(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
 
     def turn(self, at_us: SensorUs) -> None:
         """Take note that the sweep ends at *at_us*: what comes later is of the way back.
@@ -298,13 +290,14 @@ class Watch:
         track = self._memory.track
         return self._sign * (track.positions[track.peak] - LATE_DOF * self._settings.depth_of_focus_um)
 
-    def _tick(self, sample: ElpSample, end_um: float) -> None:
-        """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel."""
+    def _tick(self, sample: ElpSample, end_um: float) -> bool:
+        """Follow the sharpness of the events' own image: once per ``TICK_DOF`` of travel. Say whether it was time."""
         if abs(end_um - self._ticked_um) < TICK_DOF * self._settings.depth_of_focus_um:
-            return
+            return False
         self._ticked_um = self._here_um = end_um
         # Under a lamp a pixel has spoken at some time in the period: at its middle, in the mean.
         self._memory.advance(sample.end_us, self._sign * (end_um if self._lamp is None else sample.position_um))
+        return True
 
     @property
     def passed(self) -> bool:
@@ -322,79 +315,63 @@ class Watch:
         Once ELP has said "ahead", a change of its mind is no reason to turn round at once: with a picture from far away
         it comes some depths of focus early, and the sharpness of the image has the say. Nor is it as long as frames get
         sharper: far from focus a lens shows some fine structure with its bright and dark exchanged, and a reference
-        made of that points the wrong way.
+        made of that points the wrong way. Where the scene moves, sharpness alone is asked (``vision.bearing``).
         """
-        mutation = self._detector.mutation
-        if mutation is not None and not self._passed:
-            if self._frames_sharpen:
+        changed_us = self._heading.changed_us
+        if changed_us is not None and not self._passed:
+            if self._frames.sharpens:
                 return Direction.APPROACHING
-            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(mutation.decided_us)))
+            beyond_um = self._sign * (self._here_um - self._locate(SensorUs(changed_us)))
             if beyond_um < PATIENCE_DOF * self._settings.depth_of_focus_um:
                 return Direction.APPROACHING
-        return self._detector.direction
+        return self._heading.direction
 
     @property
     def score(self) -> float:
         """The running evidence in standard deviations: positive while focus is ahead, negative once it is behind."""
-        rally, drawdown = self._detector.approach_score, self._detector.recede_score
-        return -drawdown if drawdown > rally else rally
+        return self._heading.score
 
     # --- after the stop ---
 
     def estimate(self) -> FocusEstimate | None:
         """Say where focus was, in um on the motor's ruler; ``None`` if no witness saw it.
 
-        Asks the remembered events: milliseconds, after the stop has been sent.
+        Asks the remembered events of the pass that is over, once: milliseconds, after the stop has been sent. What an
+        earlier pass testified stands beside it.
         """
         if self.decided_us is None:
             return None
-        memory = self._memory
+        one = Pass(
+            self._memory,
+            tuple(self._frames.seen),
+            self._begun_us,
+            max(self.decided_us, min(self._turned_us, self._last_us)),
+            self._sign,
+            self._settings.speed_um_s,
+            WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um,
+            self.scene_moves,
+        )
         if self._lamp is not None:
-            vertex, window_um = memory.track.vertex(), 1e-6 * self._window_us * self._settings.speed_um_s
-            seen = [] if vertex is None else [lamp_witness(vertex, self._width_um, window_um)]
-            return self._on_the_ruler(fuse([*self._ask_frames(), *seen]))
-        end_us = max(self.decided_us, min(self._turned_us, self._last_us))
-        ruler = self._ruler(self._begun_us, end_us)
-        if end_us > memory.track.times_us[-1]:
-            memory.advance(end_us, self._sign * self._locate(SensorUs(end_us)))
-        deaf = memory.refractory()
-        dark = DARK if self._settings.frames else DARK_OF_MAP
-        said = memory.ask(memory.track.times_us[-1], ruler, self._reference.brightness, deaf.period_us, dark=dark)
-        if said is None:
-            return None
-        speed_um_us = 1e-6 * self._settings.speed_um_s
-        witnesses = [
-            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
-            for one in said.witnesses(LAG_UNEXPLAINED_LIVE, self._width_um)
-        ]
-        self.flicker = memory.flicker()
-        self.depths_um = tuple(self._sign * at for at in said.depths)
-        frames = [] if said.depths else self._ask_frames()  # of several planes frames show a mixture
-        return self._on_the_ruler(fuse([*frames, *witnesses]))
+            said = one.testify_under_a_lamp(self._locate, self._window_us)
+        else:
+            dark = DARK if self._settings.frames else DARK_OF_MAP
+            said = one.testify(self._locate, self._reference.brightness, LAG_UNEXPLAINED_LIVE, dark)
+        look_back_us = 1e6 * LOOK_BACK_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
+        self._passes.add(said, (self.decided_us - look_back_us, self.decided_us))
+        self.flicker = self._passes.flicker
+        self.depths_um = tuple(self._sign * at for at in self._passes.depths)
+        return self._passes.estimate(self._sign)
 
     @property
-    def _width_um(self) -> float:
-        """The width that the curve of log S has in this optical system."""
-        return WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um
-
-    def _on_the_ruler(self, found: FocusEstimate | None) -> FocusEstimate | None:
-        """Turn an estimate on the path of the sweep, which rises, into one on the motor's ruler."""
-        if found is None:
-            return None
-        sign = self._sign
-        return replace(
-            found,
-            focus_um=sign * found.focus_um,
-            contributions=tuple((name, sign * at, sigma, share) for name, at, sigma, share in found.contributions),
-        )
+    def peak_um(self) -> float:
+        """Where the image was sharpest, in the last pass."""
+        track = self._memory.track
+        return self._sign * track.positions[track.peak]
 
     @property
     def gap_near_crossing(self) -> bool:
-        """Whether anything was lost in the last part of the sweep, where the estimate comes from."""
-        if not self._gaps_us or self.decided_us is None:
-            return False
-        look_back_us = 1e6 * LOOK_BACK_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
-        return any(self.decided_us - look_back_us <= gap <= self.decided_us for gap in self._gaps_us)
+        """Whether anything was lost in the last part of a pass, where the estimate comes from."""
+        return self._passes.hold_any(self._gaps_us)
 
     def events_within(self, from_um: float, to_um: float) -> int:
         """Return how many events the sweep saw between two places."""
@@ -404,10 +381,20 @@ class Watch:
     def count(self, packet: CameraPacket) -> None:
         """Count the region's events of a packet that is not judged (the way back)."""
         assert self._windows is not None, "begin() comes before count()"
-        if self._periods is not None:
+        if self._lamp is not None:
             self.keep(packet)
+        self._count(packet)
+
+    def follow(self, packet: CameraPacket) -> None:
+        """Count the region's events, and let them go on building their image, while the lens goes where it is sent."""
+        assert self._windows is not None, "begin() comes before follow()"
+        self.keep(packet)
+        self._count(packet)
+
+    def _count(self, packet: CameraPacket) -> None:
+        assert self._windows is not None
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             self.events_in_cycle += sample.n_on + sample.n_off
 
     def return_score(self, focus_um: float) -> float | None:
@@ -415,19 +402,17 @@ class Watch:
 
         Only under a lamp, where events cannot simply be counted; else ``None``.
         """
-        if self._periods is None:
-            return None
-        out = self._memory.change_beyond(self._sign * focus_um).astype(np.float64)
-        product = out * self._memory.cut(self._undone)
-        return float(-product.sum() / max(np.sqrt(np.square(product).sum()), 1.0))
+        return None if self._lamp is None else self._lamp.return_score(self._memory, self._sign * focus_um)
 
     def hear_out(self, packet: CameraPacket) -> None:
         """Take a packet after the decision: what is still of the sweep belongs to it, the rest is counted."""
         assert self._windows is not None, "begin() comes before hear_out()"
-        if self._last_us < self._turned_us or self._periods is not None:
+        if self._last_us < self._turned_us or self._lamp is not None:
             self.keep(packet)
+        else:  # nobody waits for what it says, unless there is a second pass
+            self._unheard.append(replace(packet, data=packet.data.copy(), frames=()))
         for row in self._windows.feed(packet):
-            sample = self._net(self._located(row))
+            sample = self._net(self._placed.sample(row))
             if row["end_us"] <= self._turned_us:
                 self._samples.append(sample)
             count = sample.n_on + sample.n_off
@@ -438,79 +423,72 @@ class Watch:
         """Take note that the way back is under way at *at_us*, and that what is left of the sweep has died away."""
         self.back_from_us, self.events_back = at_us, 0
 
+    # --- a second pass ---
+
+    def catch_up(self) -> None:
+        """Let the events of the way back that nobody has listened to yet go on building the image."""
+        for packet in self._unheard:
+            self.keep(packet)
+        self._unheard = []
+
+    def begin_again(self, speed_um_s: float, at_us: SensorUs, from_um: float) -> None:
+        """Begin to pass focus a second time, in the same direction, at another speed.
+
+        The image is gone on with; its sharpness is followed from *from_um* on, where the play has been taken up.
+        """
+        self._remember(self._memory.built())
+        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        self._ticked_um = self._here_um = float("nan")
+        self._begun_us, self._judge_from = at_us, self._sign * from_um
+        self._turned_us = FOR_EVER
+        self._frames = FrameTrack(self.roi, follow=self.scene_moves)
+
+    def pass_again(self, packet: CameraPacket) -> None:
+        """Follow the image's sharpness in a packet of the second pass."""
+        assert self._windows is not None, "begin() comes before pass_again()"
+        self.keep(packet)
+        for row in self._windows.feed(packet):
+            sample = self._placed.sample(row)
+            self.events_in_cycle += sample.n_on + sample.n_off
+            end_um = sample.position_um + 0.5 * sample.travel_um
+            if sample.begin_us >= self._begun_us and self._sign * end_um >= self._judge_from:
+                self._tick(sample, end_um)
+        for frame in packet.frames:
+            self._measure_frame(frame)
+
+    def passed_again(self) -> None:
+        """End the second pass: from here on packets are of the way back. ``estimate`` may be asked again."""
+        track = self._memory.track
+        self.decided_us = self._turned_us = SensorUs(track.times_us[-1]) if len(track) else self._last_us
+        self.go_back(self._last_us)
+
     # --- pieces ---
+
+    def _remember(self, start: BuiltImage | None) -> None:
+        """Begin a new memory that goes on with an image.
+
+        Built anew, it would begin with the negative of what the scene looked like where the lens turned, perhaps close
+        to focus, and when the scene moves the difference of two sharp pictures is sharpest anywhere.
+        """
+        self._memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, sensor=self._sensor, start=start)
 
     def _net(self, sample: ElpSample) -> ElpSample:
         """Under a lamp, keep of a window only what whole periods leave; remember that for the estimate."""
-        if self._periods is None:
+        if self._lamp is None:
             return sample
-        net = self._periods.close(sample.begin_us, sample.end_us)
-        if not self._passed:
-            if sample.begin_us >= self._begun_us:  # else only part of a period was heard
-                self._memory.add(*net)
-        else:
-            np.add.at(self._undone, (net.y, net.x), 2 * net.on.astype(np.int32) - 1)
-        inside = self._inside[net.y, net.x]
-        weight = np.where(inside, self._reference.weights[net.y, net.x], 0).astype(np.int64)
-        sign = 2 * net.on.astype(np.int64) - 1
-        n_on = int(net.on[inside].sum())
-        return replace(
-            sample,
-            elp=-int(sign @ weight),
-            energy=int(weight @ weight),
-            n_on=n_on,
-            n_off=int(inside.sum()) - n_on,
-        )
-
-    def _located(self, row: Any) -> ElpSample:
-        begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))
-        before_us, before_um = self._located_last
-        from_um = before_um if before_us == begin else self._locate(begin)  # windows follow one another
-        to_um = self._locate(end)
-        self._located_last = end, to_um
-        return ElpSample(
-            begin,
-            end,
-            int(row["elp"]),
-            int(row["energy"]),
-            int(row["n_on"]),
-            int(row["n_off"]),
-            int(row["n_capped"]),
-            0.5 * (from_um + to_um),
-            to_um - from_um,
-        )
+        net = self._lamp.close(sample)
+        if self._passed:
+            self._lamp.undo(net)
+        elif sample.begin_us >= self._begun_us:  # else only part of a period was heard
+            self._memory.add(*net)
+        return weighed(sample, net, self._reference.weights, self._inside)
 
     def _take_frame(self, frame: Frame) -> None:
-        if frame.t_us >= self._begun_us:
-            bands = self._frame_energy.measure(frame.pixels)
-            self._frames.append((frame.t_us, bands))
-            self._frame_track.add_bands(int(frame.t_us), self._sign * self._locate(frame.t_us), bands)
+        self._measure_frame(frame)
         if self._rereference is not None and self._windows is not None:
             self._reference = self._rereference(frame)
             self._windows.set_weights(self._reference.weights, self._inside)
 
-    def _forget_frames(self) -> None:
-        self._frames: list[tuple[SensorUs, NDArray[np.float64]]] = []
-        self._frame_energy = FrameEnergy(self.roi, ROI_MARGIN_PX)
-        self._frame_track = PeakTrack()
-
-    @property
-    def _frames_sharpen(self) -> bool:
-        """Whether the newest frame of this sweep is the sharpest, by more than noise could make it."""
-        track = self._frame_track
-        return len(track) > 1 and track.drop == 0.0 and track.rise > RISE
-
-    def _ruler(self, begin_us: int, end_us: int) -> Ruler:
-        """Return the lens's path between two sensor times, finely sampled."""
-        grid = np.arange(begin_us, end_us + 4 * PATH_STEP_US, PATH_STEP_US, dtype=np.float64)
-        return Ruler.of_path(grid, np.array([self._locate(SensorUs(int(when))) for when in grid]))
-
-    def _ask_frames(self) -> list[Witness]:
-        """Ask the frames of this sweep, where three or more saw focus come and go."""
-        track = PeakTrack()
-        for when, bands in self._frames:
-            track.add_bands(int(when), self._sign * self._locate(when), bands)
-        focus = track.focus() if track.passed else None
-        if focus is None:
-            return []
-        return [frame_witness(focus, float(np.median(np.diff(track.positions))))]
+    def _measure_frame(self, frame: Frame) -> None:
+        if frame.t_us >= self._begun_us:
+            self._frames.take(frame, self._sign * self._locate(frame.t_us))

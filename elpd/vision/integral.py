@@ -62,6 +62,14 @@ def band_gain(scale_px: float) -> float:
     return float(np.square(band_stamp(scale_px), dtype=np.float64).sum())
 
 
+def band_patch(scale_px: float) -> float:
+    """Return over how many pixels white noise is one and the same in a band: the patch that counts as one sample."""
+    impulse = np.zeros((65, 65), dtype=np.float32)
+    impulse[32, 32] = 1.0
+    power = np.square(np.abs(np.fft.fft2(band_image(impulse, scale_px))))
+    return float(np.square(power).mean() / power.mean() ** 2)
+
+
 def band_image(image: NDArray[np.float32], scale_px: float) -> NDArray[np.float32]:
     """Return a band of *image*: a difference of Gaussians, *scale_px* the narrower one's sigma."""
     band = cv2.GaussianBlur(image, (0, 0), scale_px)

@@ -8,7 +8,7 @@ picture, and the vertex does not depend on the start picture.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +16,12 @@ import numpy as np
 from elpd.vision.crossing import DARK, LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
-from elpd.vision.integral import BANDS_PX, band_gain
+from elpd.vision.integral import BANDS_PX, band_gain, stamp_events
 from elpd.vision.lag import UNMEASURED_LAG_US, LagPrior
 from elpd.vision.planes import FLANK
 from elpd.vision.rebuilt import EventStretch
 from elpd.vision.refractory import Refractory, refractory_period
-from elpd.vision.track import EventEnergy, PeakTrack
+from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,6 +47,17 @@ MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
 
 
+@dataclass(frozen=True, slots=True)
+class BuiltImage:
+    """An image that earlier events have built, of a region and its margin: (height, width) in thresholds."""
+
+    levels: NDArray[np.float32]
+    events: int
+    """How many they were."""
+    pictured: bool = False
+    """Whether it began as a picture of the scene, and is one of it now; else it is a difference from what it was."""
+
+
 class EventMemory:
     """Keeps and questions the events of one sweep.
 
@@ -60,6 +71,8 @@ class EventMemory:
         (height, width) of the sensor: pixels not to listen to.
     sensor:
         What a calibration knows: hot pixels are not heard, the lag is not guessed.
+    start:
+        The image that earlier events have built, upon which these go on building.
     """
 
     def __init__(
@@ -69,6 +82,7 @@ class EventMemory:
         max_events: int = MAX_EVENTS,
         hot: NDArray[np.bool_] | None = None,
         sensor: SensorProfile | None = None,
+        start: BuiltImage | None = None,
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
@@ -79,14 +93,15 @@ class EventMemory:
         for x, y in sensor.hot_pixels if sensor is not None else ():
             if self._left <= x < self._right and self._top <= y < self._bottom:
                 self._cap.silence(x - self._left, y - self._top)
-        self._energy = EventEnergy(height, width, ROI_MARGIN_PX)
+        self._start = start
+        self._energy = EventEnergy(height, width, ROI_MARGIN_PX, None if start is None else start.levels)
         self._shape = (height, width)
         self._columns = _columns(FIRST_CAPACITY)
         self._count = 0
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
-        self._forgotten = 0
+        self._forgotten = 0 if start is None else start.events
         self._hot = None if hot is None or not hot.any() else hot
         self.capped = 0
         self.depths: tuple[float, ...] = ()
@@ -110,6 +125,24 @@ class EventMemory:
         for column, values in zip(self._columns, events, strict=True):
             column[part] = values[keep]
         self._count += count
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """The image at the last ``advance``, (height, width) of the region and its margin, in thresholds: a view."""
+        return self._energy.image
+
+    @property
+    def pictured(self) -> bool:
+        """Whether the image began as a picture of the scene."""
+        return self._start is not None and self._start.pictured
+
+    def built(self) -> BuiltImage:
+        """Return what all events so far have built, those after the last ``advance`` too."""
+        levels = self._energy.image.copy()
+        part = slice(self._taken, self._count)
+        _, x, y, on = self._columns
+        stamp_events(x[part], y[part], on[part], POINT, levels)
+        return BuiltImage(levels, self._forgotten + self._count, self.pictured)
 
     def _make_room(self, count: int) -> None:
         """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""
@@ -214,7 +247,8 @@ class EventMemory:
         position = sign * ruler.at(self._t_us[part] + round(deaf_us))
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
-        events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX)
+        base = None if self._start is None else self._start.levels
+        events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base)
         if begin > 0 or self._forgotten:
             start = None
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class EventStretch:
-    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions."""
+    """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions.
+
+    ``base``, (height, width), is the image in thresholds that earlier events had built; ``None`` for nothing.
+    """
 
     t_us: NDArray[np.int64]
     x: NDArray[np.uint16]
@@ -32,6 +35,7 @@ class EventStretch:
     height: int
     width: int
     margin: int
+    base: NDArray[np.float32] | None = None
 
 
 def by_pixel(events: EventStretch) -> Groups:
@@ -44,7 +48,10 @@ def rebuilt(events: EventStretch, groups: Groups, ticks: NDArray[np.float64]) ->
     level = np.empty((ticks.size, events.height * events.width), dtype=np.float32)
     starts, order = groups
     rebuild_levels(starts, events.position[order], events.on[order], ticks, level)
-    return level.reshape(ticks.size, events.height, events.width)
+    images = level.reshape(ticks.size, events.height, events.width)
+    if events.base is not None:
+        images += events.base
+    return images
 
 
 def busiest_rows(events: EventStretch, pixels: int) -> slice:
@@ -67,6 +74,7 @@ def rows_of(events: EventStretch, rows: slice) -> EventStretch:
         rows.stop - rows.start,
         events.width,
         events.margin,
+        None if events.base is None else events.base[rows],
     )
 
 

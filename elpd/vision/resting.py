@@ -2,7 +2,8 @@
 
 A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
 than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
-told from a hand that shakes.
+told from a hand that shakes. Where signs lie together as those of one moving edge do, the scene moves, and its image
+is gone on with when the sweep begins.
 """
 
 from __future__ import annotations
@@ -14,12 +15,17 @@ import numpy as np
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
 from elpd.vision.flicker import find_flicker, residue
+from elpd.vision.integral import band_energy, band_gain, band_patch, inside_margin
+from elpd.vision.memory import BuiltImage
+from elpd.vision.track import frame_levels
 from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-    from elpd.records import Geometry, Roi
+    from elpd.records import Frame, Geometry, Roi
     from elpd.vision.flicker import Flicker
 
 LISTEN_MS = 35.0
@@ -36,6 +42,13 @@ HOT_SIGMAS = 5.0
 HOT_EVENTS = 3.0
 """A pixel is hot where it fires this many standard deviations and events more often than its second busiest neighbour:
 an edge that trembles makes neighbours fire alike. By chance one in 10⁸ pixels does."""
+
+SIGMAS_OF_MOTION = 4.0
+"""How much more order than independent events have shows that the scene moved while the lens stood still. A false
+alarm costs a second pass."""
+
+ORDER_PX = 2.4
+"""Scale at which events of one moving edge agree, in a picture that is out of focus."""
 
 
 class Resting:
@@ -54,6 +67,7 @@ class Resting:
         """The region and its margin, as pixels of the sensor."""
         self._pieces: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]] = []
         self._count = 0
+        self._frame: Frame | None = None
         self._begin_us: int | None = None
         self._end_us = 0
         self.hot = np.zeros((geometry.height, geometry.width), np.bool_)
@@ -66,6 +80,11 @@ class Resting:
         """Events of the region that are not hot pixels'."""
         self.noise_hz = 0.0
         """The same per pixel and second."""
+        self.frame_times_us: list[int] = []
+        self.moves = False
+        """Whether the events lie together as those of a moving scene do, known after ``settle``."""
+        self.image_at_start: BuiltImage | None = None
+        """Where the scene moves, what it looks like now: a frame and the events since, or the events alone."""
 
     def add(
         self,
@@ -86,6 +105,12 @@ class Resting:
             pixel = y[inside].astype(np.int64) * self._geometry.width + x[inside]
             self._pieces.append((t_us[inside].copy(), pixel, on[inside].copy()))
             self._count += pixel.size
+
+    def see(self, frames: Iterable[Frame]) -> None:
+        """Take frames, in time order."""
+        for frame in frames:
+            self._frame = frame
+            self.frame_times_us.append(int(frame.t_us))
 
     @property
     def restless(self) -> bool:
@@ -115,6 +140,8 @@ class Resting:
         self.hot = self._hot(pixel, on)
         kept = ~self.hot.ravel()[pixel]
         t_us, pixel, on = t_us[kept], pixel[kept], on[kept]
+        if self.flicker is None:  # under a lamp all signs swing together, whatever the scene does
+            self._look_for_motion(t_us, pixel, on)
         counted = int(self._inside.ravel()[pixel].sum())
         self.events = counted
         duration_us = self.duration_us
@@ -135,6 +162,27 @@ class Resting:
         t_us, pixel, on = (np.concatenate(column) for column in zip(*self._pieces, strict=True))
         self._pieces = [(t_us, pixel, on)]
         return t_us, pixel, on
+
+    def _look_for_motion(self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> None:
+        levels = self._levels(pixel, on)
+        self.moves = order(levels) > SIGMAS_OF_MOTION
+        if not self.moves:
+            return
+        if self._frame is None:
+            self.image_at_start = BuiltImage(levels, t_us.size)
+            return
+        since = t_us >= self._frame.t_us
+        levels = self._levels(pixel[since], on[since]) + self._cut(frame_levels(self._frame.pixels))
+        self.image_at_start = BuiltImage(levels, int(since.sum()), pictured=True)
+
+    def _levels(self, pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the image that events build, of the region and its margin, in thresholds."""
+        net = np.bincount(pixel, weights=2.0 * on - 1.0, minlength=self.heard.size).reshape(self.heard.shape)
+        return self._cut(net.astype(np.float32))
+
+    def _cut(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        rows, columns = np.flatnonzero(self.heard.any(axis=1)), np.flatnonzero(self.heard.any(axis=0))
+        return np.ascontiguousarray(image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
 
     def _net_of_periods(
         self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], period_us: float
@@ -180,3 +228,18 @@ def hot_pixels(count: NDArray[np.int64]) -> NDArray[np.bool_]:
             highest = np.maximum(highest, one)
     expected = second + float(count.mean())
     return np.asarray(count - second > HOT_EVENTS + HOT_SIGMAS * np.sqrt(expected), np.bool_)
+
+
+def order(levels: NDArray[np.float32]) -> float:
+    """Say by how many standard deviations events lie together by their sign, as a moving scene's do.
+
+    *levels* is the image they have built, a region and its margin, in thresholds. Its energy in a band of some pixels
+    is compared with what independent events would have: each pixel's own part, so that noisy pixels are not taken for
+    order, and its scatter over the region.
+    """
+    inside = levels[inside_margin((levels.shape[0], levels.shape[1]), ROI_MARGIN_PX)]
+    by_itself = band_gain(ORDER_PX) * float(np.square(inside).mean())
+    if by_itself == 0.0:
+        return 0.0
+    excess = band_energy(levels, ORDER_PX, np.ones_like(levels), ROI_MARGIN_PX) / by_itself - 1.0
+    return excess / float(np.sqrt(2.0 * band_patch(ORDER_PX) / inside.size))

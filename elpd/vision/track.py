@@ -16,6 +16,7 @@ from elpd.vision.bands import band_energies, focus_of_bands
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
+    band_image,
     band_stamp,
     fit_vertex,
     inside_margin,
@@ -38,7 +39,18 @@ RISE = 0.10
 FIT_DROP = 0.25
 """How far down the curve's sides a parabola is believed."""
 
-_FRAME_GROUND = 10.0 / 255.0
+FRAME_GROUND = 10.0 / 255.0
+"""Added to a frame's brightness, of which one is full scale, before its logarithm: read noise shows no structure."""
+
+FOLLOW_PX = 1.2
+"""Scale of the structure by which a scene is followed: it is there in every frame around focus."""
+
+USUAL_THRESHOLD = 0.2
+"""A contrast threshold of event cameras as they are set. A direction is right with a third less or more of it."""
+
+POINT = np.ones((1, 1), np.float32)
+"""The stamp that adds an event to nothing but its own pixel."""
+
 _FLOOR = 1e-12
 
 
@@ -158,12 +170,26 @@ class PeakTrack:
         return None if found is None else found.mirrored(sign)
 
 
-class FrameEnergy:
-    """``log S`` of whole frames over a region, weighted by the brightness of the first."""
+def frame_levels(pixels: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Return a frame's log brightness, (height, width), counted in contrast thresholds of a usual setting."""
+    scale = full_scale(pixels) or 1.0
+    image = pixels.astype(np.float32) / np.float32(scale)
+    return np.asarray(np.log(image + np.float32(FRAME_GROUND)) / np.float32(USUAL_THRESHOLD), dtype=np.float32)
 
-    def __init__(self, roi: Roi, margin: int) -> None:
+
+class FrameEnergy:
+    """``log S`` of whole frames over a region, weighted by the brightness of the first.
+
+    With *follow* the region goes with the scene, from frame to frame by phase correlation, as far as the margin lets
+    it: what a shaking hand moves in and out of a region that stands still would pass for focus.
+    """
+
+    def __init__(self, roi: Roi, margin: int, *, follow: bool = False) -> None:
         self._roi = roi
         self._margin = margin
+        self._follow = follow
+        self._before: NDArray[np.float32] | None = None
+        self._shift_px = np.zeros(2)
         self._weight: NDArray[np.float32] | None = None
 
     def measure(self, pixels: NDArray[np.generic]) -> NDArray[np.float64]:
@@ -178,26 +204,43 @@ class FrameEnergy:
             self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
-        energies = band_energies(np.log(image + np.float32(_FRAME_GROUND)), self._weight * inside)
+        levels = np.log(image + np.float32(FRAME_GROUND))
+        energies = band_energies(levels, self._weight * self._moved(inside, levels))
         return np.asarray(np.log(energies + _FLOOR))
+
+    def _moved(self, inside: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the region's mask where its scene has gone to."""
+        if not self._follow:
+            return inside
+        band = cv2.GaussianBlur(levels, (0, 0), FOLLOW_PX) - cv2.GaussianBlur(levels, (0, 0), 4 * FOLLOW_PX)
+        if self._before is not None:
+            window = cv2.createHanningWindow((band.shape[1], band.shape[0]), cv2.CV_32F)
+            step, _ = cv2.phaseCorrelate(self._before, np.asarray(band, np.float32), window)
+            self._shift_px = np.clip(self._shift_px + np.array(step), -self._margin, self._margin)
+        self._before = np.asarray(band, np.float32)
+        shift = np.array([[1.0, 0.0, self._shift_px[0]], [0.0, 1.0, self._shift_px[1]]])
+        return np.asarray(cv2.warpAffine(inside, shift, (inside.shape[1], inside.shape[0])), np.float32)
 
 
 class EventEnergy:
-    """``log S`` of the image that events build, from nothing.
+    """``log S`` of the image that events build, from nothing or upon a *start*, (height, width), in thresholds.
 
-    The band-passed image is what is kept: an event adds the band's impulse response around its pixel, a hundred
+    The band-passed image is what is measured: an event adds the band's impulse response around its pixel, a hundred
     products, and a look at the sharpness is a sum of squares. Filtering the image anew at every look would cost the
     whole region each time, at 4 mm/s more than a thousand times a second.
     """
 
-    def __init__(self, height: int, width: int, margin: int) -> None:
-        self._band = np.zeros((height, width), dtype=np.float32)
+    def __init__(self, height: int, width: int, margin: int, start: NDArray[np.float32] | None = None) -> None:
+        self.image = np.zeros((height, width), dtype=np.float32) if start is None else start.copy()
+        """The image itself, in thresholds."""
+        self._band = np.zeros((height, width), dtype=np.float32) if start is None else band_image(start, BANDS_PX[0])
         self._stamp = band_stamp(BANDS_PX[0])
         self._inside = inside_margin((height, width), margin)
 
     def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Take events, in coordinates of the image."""
         stamp_events(x, y, on, self._stamp, self._band)
+        stamp_events(x, y, on, POINT, self.image)
 
     def measure(self) -> float:
         """Return log S now."""

@@ -1,0 +1,65 @@
+"""Scenes that move: the direction is found all the same, and one pass over focus is not trusted where it cannot be."""
+
+from __future__ import annotations
+
+import pytest
+from scenarios import Story, assert_invariants, play
+
+from elpd.records import Outcome
+
+DEPTH_OF_FOCUS_UM = 6.0
+
+
+def shown(motion: str, seed: int, start_um: float = -200.0) -> Story:
+    story = play(f"sim.motion={motion}", "sim.camera=davis346", f"sim.seed={seed}", f"sim.start_um={start_um}")
+    assert_invariants(story)
+    return story
+
+
+@pytest.mark.parametrize("motion", ["violent", "shake"])
+@pytest.mark.parametrize("start_um", [-200.0, 200.0])
+def test_a_moving_scene_is_focused_or_refused_and_the_first_verdict_is_right(motion: str, start_um: float) -> None:
+    for seed in (1, 2):
+        story = shown(motion, seed, start_um)
+        assert story.outcome in {Outcome.FOCUSED, Outcome.LOW_CONFIDENCE}
+        if story.outcome is Outcome.FOCUSED:
+            final_um = story.errors["final_error_um"]
+            assert final_um is not None
+            assert abs(final_um) <= DEPTH_OF_FOCUS_UM
+        first = story.named("sweep")[0]
+        away = (first["sign"] > 0) == (start_um > 0)
+        assert (first["end"] == "behind") == away
+        assert story.result is not None
+        assert story.result.reversals == int(away)
+
+
+def test_where_one_pass_is_not_enough_a_second_is_made_and_its_time_is_told() -> None:
+    story = shown("shake", 1)
+    assert story.result is not None
+    assert story.result.details["method"] == "two_crossings"
+    told_ms = {phase.name: phase.ms for phase in story.result.phases}
+    assert story.phases.index("stop") < story.phases.index("recross")
+    assert told_ms["recross"] > 20.0
+
+
+def test_where_one_pass_is_enough_no_second_is_made() -> None:
+    story = shown("static", 1)
+    assert story.outcome is Outcome.FOCUSED
+    assert "recross" not in story.phases
+    assert story.result is not None
+    assert story.result.details["method"] != "two_crossings"
+
+
+def test_the_second_pass_leads_over_focus_in_the_direction_of_the_sweep() -> None:
+    story = shown("violent", 2)  # of the first the sensor at rest sees no motion
+    begun = next(fields for fields in story.named("phase") if fields["name"] == "recross")
+    assert story.result is not None
+    sign = story.result.details["sweep_sign"]
+    moves = [command for command in story.commands if command.name == "move_to"]
+    assert len(moves) >= 2, begun
+    places_um = story.truth.mechanism.motor_steps(story.history_ns()) * story.truth.mechanism.mechanics.um_per_step
+    focus_um = story.truth.focus_um(sign)
+    assert focus_um is not None
+    ahead = sign * (places_um - focus_um) > 0
+    forth = (~ahead[:-1] & ahead[1:]).sum()
+    assert forth >= 2

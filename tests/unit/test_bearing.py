@@ -1,0 +1,165 @@
+"""The direction from the image's sharpness, and what the image is made of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+
+from elpd.events.decoder import EventArrays
+from elpd.records import Direction, Frame, Geometry, Roi
+from elpd.units import SensorUs
+from elpd.vision.bearing import Bearing
+from elpd.vision.integral import band_energy, band_gain, band_patch
+from elpd.vision.memory import EventMemory
+from elpd.vision.resting import Resting, order
+from elpd.vision.track import FrameEnergy, frame_levels
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SIZE = 96
+ROI = Roi(0, 0, SIZE, SIZE)
+GEOMETRY = Geometry(SIZE, SIZE)
+
+
+def scene(blur_px: float, shift_px: int = 0, seed: int = 3) -> NDArray[np.float32]:
+    grain = np.random.default_rng(seed).standard_normal((2 * SIZE, 2 * SIZE)).astype(np.float32)
+    image = 40.0 * cv2.GaussianBlur(grain, (0, 0), blur_px)
+    return np.ascontiguousarray(image[40 : 40 + SIZE, 40 + shift_px : 40 + shift_px + SIZE])
+
+
+def events_at(seed: int, count: int, on: NDArray[np.uint8] | None = None) -> EventArrays:
+    rng = np.random.default_rng(seed)
+    x, y = (rng.integers(SIZE, size=count).astype(np.uint16) for _ in range(2))
+    p = rng.integers(2, size=count).astype(np.uint8) if on is None else on[y, x]
+    return EventArrays(np.arange(count, dtype=np.int64) * 20, x, y, p)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("end_px", "direction"), [(2.0, Direction.APPROACHING), (8.0, Direction.RECEDING)])
+def test_a_picture_that_shakes_tells_the_direction(seed: int, end_px: float, direction: Direction) -> None:
+    bearing = Bearing(14, pictured=True)
+    shifts = np.random.default_rng(seed).integers(-1, 2, size=30).cumsum()
+    for blur, shift in zip(np.linspace(4.5, end_px, 30), shifts, strict=True):
+        bearing.look(scene(float(blur), int(shift)))
+    assert bearing.direction is direction
+
+
+def test_shaking_alone_is_no_direction() -> None:
+    bearing = Bearing(14, pictured=True)
+    for shift in np.random.default_rng(5).integers(-1, 2, size=30).cumsum():
+        bearing.look(scene(4.0, int(shift)))
+    assert bearing.direction is Direction.UNKNOWN
+
+
+@pytest.mark.parametrize(("end_px", "direction"), [(1.0, Direction.APPROACHING), (9.0, Direction.RECEDING)])
+def test_the_difference_from_the_start_tells_it_too(end_px: float, direction: Direction) -> None:
+    bearing = Bearing(14, pictured=False)
+    start = scene(4.5)
+    for k, blur in enumerate(np.linspace(4.5, end_px, 40)):
+        bearing.look(scene(float(blur), k // 2) - start)
+    assert bearing.direction is direction
+
+
+def test_a_verdict_stands() -> None:
+    bearing = Bearing(14, pictured=True)
+    for blur in (4.5, 4.0, 3.0, 2.0, 4.0, 6.0, 9.0):
+        bearing.look(scene(blur))
+    assert bearing.direction is Direction.APPROACHING
+
+
+def test_after_a_reversal_the_same_fall_is_not_enough() -> None:
+    first, again = Bearing(14, pictured=True), Bearing(14, pictured=True, again=True)
+    for fall in np.linspace(0.0, 0.1, 12):
+        first.look(scene(4.5) * np.float32(np.exp(-float(fall) / 2)))
+        again.look(scene(4.5) * np.float32(np.exp(-float(fall) / 2)))
+    assert first.direction is Direction.RECEDING
+    assert again.direction is Direction.UNKNOWN
+
+
+def rested(events: EventArrays, *frames: Frame) -> Resting:
+    resting = Resting(ROI, GEOMETRY)
+    resting.add(*events, None)
+    resting.see(frames)
+    resting.settle(np.zeros((SIZE, SIZE), np.int16))
+    return resting
+
+
+def levels_of(events: EventArrays, start: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    levels = np.zeros((SIZE, SIZE), np.float32) if start is None else start.copy()
+    np.add.at(levels, (events.y, events.x), np.where(events.p > 0, 1.0, -1.0).astype(np.float32))
+    return levels
+
+
+def test_independent_events_are_no_motion_and_an_edge_that_moves_is() -> None:
+    assert not rested(events_at(1, 600)).moves
+    assert rested(events_at(1, 600)).image_at_start is None
+    assert rested(events_at(1, 600, (scene(3.0) > 0).astype(np.uint8))).moves
+
+
+def test_a_pixel_that_fires_alone_is_no_motion() -> None:
+    levels = np.zeros((SIZE, SIZE), np.float32)
+    levels[40, 40] = 200.0
+    assert order(levels) < 4.0
+
+
+def test_the_order_of_noise_scatters_by_its_own_standard_deviation() -> None:
+    orders = [order(levels_of(events_at(seed, 1500))) for seed in range(60)]
+    assert abs(np.mean(orders)) < 0.5
+    assert 0.5 < np.std(orders) < 1.5
+
+
+def test_a_patch_is_what_white_noise_varies_over() -> None:
+    rng = np.random.default_rng(1)
+    weight = np.ones((128, 128), np.float32)
+    energies = [band_energy(rng.standard_normal((128, 128)).astype(np.float32), 2.4, weight) for _ in range(80)]
+    assert np.mean(energies) == pytest.approx(band_gain(2.4), rel=0.05)
+    expected = np.sqrt(2.0 * band_patch(2.4) / weight.size)
+    assert np.std(energies) / np.mean(energies) == pytest.approx(expected, rel=0.3)
+
+
+def test_an_image_goes_on_where_the_one_before_left_off() -> None:
+    first, whole = EventMemory(ROI, GEOMETRY), EventMemory(ROI, GEOMETRY)
+    events = events_at(2, 900)
+    parts = [
+        EventArrays(events.t[part], events.x[part], events.y[part], events.p[part])
+        for part in (slice(0, 300), slice(300, 500), slice(500, 900))
+    ]
+    first.add(*parts[0])
+    first.advance(3_000, 0.0)
+    first.add(*parts[1])  # not in the curve any more, and yet in the image
+    second = EventMemory(ROI, GEOMETRY, start=first.built())
+    second.add(*parts[2])
+    second.advance(1_000_000, 1.0)
+    whole.add(*events)
+    whole.advance(1_000_000, 1.0)
+    np.testing.assert_array_equal(second.image, whole.image)
+    assert second.built().events == whole.built().events == 900
+    assert second.track.values[-1] == pytest.approx(whole.track.values[-1], abs=1e-4)
+
+
+def test_what_was_seen_since_a_frame_is_built_upon_it() -> None:
+    events = events_at(4, 700, (scene(3.0) > 0).astype(np.uint8))
+    pixels = np.clip(100 + 10 * scene(2.0, seed=8), 0, 255).astype(np.uint8)
+    when = SensorUs(int(events.t[300]))
+    start = rested(events, Frame(when, when, 0, pixels)).image_at_start
+    assert start is not None
+    assert start.pictured
+    assert start.events == 400
+    since = EventArrays(events.t[300:], events.x[300:], events.y[300:], events.p[300:])
+    np.testing.assert_allclose(start.levels, levels_of(since, frame_levels(pixels)), atol=1e-4)
+
+
+def test_a_region_that_goes_with_its_scene_sees_the_same_sharpness() -> None:
+    picture = np.random.default_rng(6).standard_normal((160, 160)).astype(np.float32)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    picture[:, 70:] *= 4.0  # busier on one side: a region that stands still would take the shift for focus
+    frames = [np.clip(120 + 100 * picture[20:116, 20 + k : 116 + k], 0, 255).astype(np.uint8) for k in range(0, 10, 2)]
+    roi = Roi(32, 32, 32, 32)
+    follows, stands = FrameEnergy(roi, 14, follow=True), FrameEnergy(roi, 14)
+    followed = [follows.measure(frame) for frame in frames]
+    stood = [stands.measure(frame) for frame in frames]
+    assert (np.ptp(followed, axis=0) < 0.5 * np.ptp(stood, axis=0)).all()
