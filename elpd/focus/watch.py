@@ -46,6 +46,10 @@ TICK_DOF = 0.5
 PATIENCE_DOF = 8.0
 """How far beyond a sign change of ELP the image's sharpness may take to agree: a curve's width and a half."""
 
+FAR_DROP = 0.2
+"""The lens goes on until log S has fallen so far: pairs that answer late would be missing otherwise, and with them the
+late half of the midpoints. Stopping at half of this is 2 ms sooner and costs 0.3 um of bias."""
+
 AFTERMATH_DOF = 2.0
 """Travel beyond the decision whose events still count: pixels with little contrast answer late."""
 
@@ -252,7 +256,8 @@ class Watch:
             if self._sign * sample.position_um < self._judge_from:
                 continue
             self._heading.feed(sample, self._memory, ticked=ticked)
-            if self._heading.seen_ahead and not self._passed and self._memory.peak_passed:
+            far = self._memory.track.drop > FAR_DROP
+            if self._heading.seen_ahead and not self._passed and far and self._memory.peak_passed:
                 self._passed = True
                 self.decided_us = SensorUs(max(sample.end_us, self._last_us))
         self._samples += samples
