@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex
+from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,19 +60,12 @@ def band_products(
     one: NDArray[np.float32], other: NDArray[np.float32], weight: NDArray[np.float32], margin: int = 0
 ) -> NDArray[np.float64]:
     """Return the weighted mean product of each band of two images, and last that of the band of noise: (bands + 1,)."""
-    middle = inside(one.shape, margin)
+    middle = inside_margin(one.shape, margin)
     first = _filtered(one, middle)
     second = first if other is one else _filtered(other, middle)
     return np.array(
         [float((a * b * weight[middle]).mean(dtype=np.float64)) for a, b in zip(first, second, strict=True)]
     )
-
-
-def inside(shape: tuple[int, ...], margin: int) -> tuple[slice, slice]:
-    """Return what is left of an image without its margins: of a small one, at least the middle eight pixels."""
-    margin = max(0, min(margin, (min(shape) - 8) // 2))
-    middle = slice(margin, -margin or None)
-    return middle, middle
 
 
 def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 
 from elpd.records import FocusEstimate
-from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise, inside
-from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex
+from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
+from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
 from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
@@ -219,18 +219,14 @@ def ask_events(
     candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
     image = average_focus(candidates) if candidates else None
     energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
-    lags = (
-        [
-            Lag(float(np.average(slow, weights=energy)) * one.at, float(np.average(slow, weights=energy)) * one.sigma)
-            for slow, one in zip(slownesses, late.candidates, strict=True)
-        ]
-        if energy.any()
-        else late.candidates
-    )
+    lags = late.candidates
+    if energy.any():
+        typical = [float(np.average(slow, weights=energy)) for slow in slownesses]
+        lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
     lag = average_lag(lags, late.weights)
     if image is not None:
         image = replace(image, at=image.at - lag.at)
-    seen = float((energy[inside(energy.shape, events.margin)]).mean())
+    seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     return EventWitnesses(image, pairs, lag, LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12))
 
 

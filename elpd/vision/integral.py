@@ -9,7 +9,7 @@ looked like does not matter, because ``|h(z) - h(z_start)|²`` is as symmetric i
 Events say where a level was crossed, not where the intensity is: a pixel that has turned stays silent until it has
 fallen by what it had risen beyond its last event, plus one threshold. So the image at a decision is *rebuilt*: levels
 are joined linearly, and at a turn the mirror of the last rise is inserted (the idea of ``pairs``, per pixel). Threshold
-mismatch between pixels adds a pattern that grows with the square of the event counts; its expectation is subtracted.
+mismatch between pixels adds a pattern that is white in space; ``elpd.vision.bands`` measures and subtracts it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BANDS_PX = (0.8, 1.2, 1.8, 2.7)
 _BAND_RATIO = 1.6
 
 
-def inside_margin(shape: tuple[int, int], margin: int) -> tuple[slice, slice]:
+def inside_margin(shape: tuple[int, ...], margin: int) -> tuple[slice, slice]:
     """Return what a margin of *margin* pixels at each side leaves of an image.
 
     Of a small image less is left out: at least its middle eight pixels are measured.
@@ -42,7 +42,7 @@ def inside_margin(shape: tuple[int, int], margin: int) -> tuple[slice, slice]:
 
 def band_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int = 0) -> float:
     """Return the weighted mean square of one band of *image*, leaving a margin out of the mean (``inside_margin``)."""
-    inside = inside_margin((image.shape[0], image.shape[1]), margin)
+    inside = inside_margin(image.shape, margin)
     square = np.square(band_image(image, scale_px)[inside])
     square *= weight[inside]
     return float(square.mean(dtype=np.float64))

@@ -237,7 +237,7 @@ def order(levels: NDArray[np.float32]) -> float:
     is compared with what independent events would have: each pixel's own part, so that noisy pixels are not taken for
     order, and its scatter over the region.
     """
-    inside = levels[inside_margin((levels.shape[0], levels.shape[1]), ROI_MARGIN_PX)]
+    inside = levels[inside_margin(levels.shape, ROI_MARGIN_PX)]
     by_itself = band_gain(ORDER_PX) * float(np.square(inside).mean())
     if by_itself == 0.0:
         return 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import binascii
 import struct
 from dataclasses import dataclass
 
@@ -36,12 +37,7 @@ _REPLY = struct.Struct("<BBBHiiII")
 
 def crc16(data: bytes) -> int:
     """Return the CRC-16 of *data*: polynomial 0x1021, start 0xFFFF, no reflection."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
-    return crc
+    return binascii.crc_hqx(data, 0xFFFF)
 
 
 def encode(sequence: int, command: int, payload: bytes = b"") -> bytes:

@@ -32,11 +32,6 @@ class Agenda:
         """When the last of the queue happens; the present if it is empty."""
         return self._queue[-1][0] if self._queue else self.now_ns
 
-    @property
-    def queued(self) -> int:
-        """How many wait in the queue."""
-        return len(self._queue)
-
     def put(self, slot: str, at_ns: int | None, action: Callable[[int], None]) -> None:
         """Let *action* happen at *at_ns* instead of what was in the slot; with ``None`` nothing will."""
         self._slots.pop(slot, None)
