@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import latency
-import pytest
 
 
 def test_it_prints_every_row_of_both_tables(
