@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from typing import TYPE_CHECKING
 
 import latency
 
+if TYPE_CHECKING:
+    import pytest
 
-def test_it_prints_every_row_of_both_tables(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+
+def test_it_prints_both_tables_whole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("sys.argv", ["latency.py", "--json", "--stops", "3", "--packets", "5", "--words", "200"])
     assert latency.main() == 0
     answer = json.loads(capsys.readouterr().out)
