@@ -237,6 +237,16 @@ class Outputs(Protocol):
 
 
 @runtime_checkable
+class Remarks(Protocol):
+    """A device that notices what a person should change about how it is connected."""
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """Whole sentences: what was measured, what is expected, what to do; none where all is well."""
+        ...
+
+
+@runtime_checkable
 class Closeable(Protocol):
     """Anything to give back at the end."""
 
