@@ -314,7 +314,7 @@ def test_events_alone_do_not_tell_the_lag_of_a_fast_sweep(folder: Any, monkeypat
     path, focus_us = folder
     code, out, _ = run(monkeypatch, capsys, path / "events.npz", "--roi", "8,8,80,80", "--json")
     found = json.loads(out)
-    # A photoreceptor may be late by milliseconds, of which each is 4 um here; without a picture nothing says by how many.
+    # A photoreceptor may be late by milliseconds, of 4 um each here; without a picture nothing says by how many.
     assert (code, found["outcome"]) == (1, "LOW_CONFIDENCE")
     assert abs(found["focus_us"] - focus_us) < found["sigma_us"]
     assert found["sigma_us"] > 2_000
