@@ -22,21 +22,30 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 ROOT = Path(__file__).parents[1]
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
-_NEEDED = ("systemctl", "systemd-sysusers", "systemd-analyze", "journalctl", "dbus-daemon", "unshare", "nsenter", "mount")
+_NEEDED = (
+    "systemctl",
+    "systemd-sysusers",
+    "systemd-analyze",
+    "journalctl",
+    "dbus-daemon",
+    "unshare",
+    "nsenter",
+)
 _UNSHARE = ("unshare", "--pid", "--fork", "--mount", "--net", "--ipc", "--uts", "--cgroup", "--propagation", "private")
 _BOOT_S = 30.0
 
 _BOOT = r"""
 set -eu
 mount -t tmpfs -o size=1G tmpfs "$TREE"
-cd "$TREE"; mkdir upper work root; mount -t overlay overlay -o "lowerdir=/,upperdir=$TREE/upper,workdir=$TREE/work" root; cd root
+cd "$TREE"; mkdir upper work root
+mount -t overlay overlay -o "lowerdir=/,upperdir=$TREE/upper,workdir=$TREE/work" root; cd root
 mount -t tmpfs -o mode=755 tmpfs run; mount -t tmpfs tmpfs tmp
 mount -t proc proc proc; mount -t sysfs -o ro sysfs sys; mount -t cgroup2 cgroup2 sys/fs/cgroup
 mount -t tmpfs -o mode=755 tmpfs dev
@@ -50,9 +59,13 @@ while IFS="=" read -r inside outside; do
     mkdir -p "./$inside"; mount --bind "$outside" "./$inside"; mount -o remount,bind,ro "./$inside"
 done <"$BINDS"
 chroot . systemd-sysusers
-chroot . systemd-tmpfiles --create --prefix=/etc/elpd --prefix=/var/lib/elpd --prefix=/var/cache/elpd --prefix=/var/log/elpd
 export container=tests
 exec chroot . /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
+"""
+
+_TRIAL = """
+mount -t tmpfs tmpfs "$1"; cd "$1"; mkdir u w r
+mount -t overlay overlay -o "lowerdir=/,upperdir=$1/u,workdir=$1/w" r
 """
 
 _TARGET = """[Unit]
@@ -80,9 +93,8 @@ def why_not() -> str | None:
     if not Path("/lib/systemd/systemd").exists():
         return "systemd is not installed; see tools/packages"
     with tempfile.TemporaryDirectory() as folder:
-        script = 'cd "$1"; mount -t tmpfs t .; cd "$1"; mkdir u w r; mount -t overlay o -o lowerdir=/,upperdir=$PWD/u,workdir=$PWD/w r'
         tried = subprocess.run(
-            [*_UNSHARE, "sh", "-ec", script, "sh", folder], capture_output=True, text=True, check=False
+            [*_UNSHARE, "sh", "-ec", _TRIAL, "sh", folder], capture_output=True, text=True, check=False
         )
     if tried.returncode:
         return f"no private namespaces here: {tried.stderr.strip()}"
@@ -126,7 +138,7 @@ class Booted:
         self._folder = Path(tempfile.mkdtemp(prefix="elpd-booted-"))
         self._cgroup = _cgroups() / self._folder.name
 
-    def __enter__(self) -> Booted:
+    def __enter__(self) -> Self:
         try:
             self._boot()
             self.until(self._is_up, "systemd to come up", _BOOT_S)
@@ -135,7 +147,9 @@ class Booted:
             raise
         return self
 
-    def __call__(self, *arguments: str, check: bool = True, text: str | None = None) -> subprocess.CompletedProcess[str]:
+    def __call__(
+        self, *arguments: str, check: bool = True, text: str | None = None
+    ) -> subprocess.CompletedProcess[str]:
         """Run a command inside, as root; *text* is its stdin."""
         done = subprocess.run(
             [*self._inside(), *arguments], capture_output=True, text=True, input=text, check=False, cwd="/", env=_ENV
@@ -247,6 +261,7 @@ class Booted:
                     time.sleep(0.02)
 
 
+Finished = subprocess.CompletedProcess[str]
 _ENV = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LANG": "C.UTF-8"}
 
 
