@@ -261,7 +261,6 @@ class Booted:
                     time.sleep(0.02)
 
 
-Finished = subprocess.CompletedProcess[str]
 _ENV = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LANG": "C.UTF-8"}
 
 
