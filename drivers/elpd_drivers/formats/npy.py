@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import FormatError, UsageError
-from elpd.events.layout import columns, event_columns
+from elpd.events.layout import EVENT, columns, event_columns, packed
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 MEMBERS = (("t", "timestamp", "ts"), ("x",), ("y",), ("p", "on", "polarity"))
 
 
@@ -167,10 +166,7 @@ def _pack(path: Path, t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDAr
                 raise FormatError(f"{path}: {name} must be whole numbers (t in microseconds); it holds fractions")
             column = rounded.astype(np.int64)
         whole.append(column)
-    packed = np.empty(len(t), EVENT)
-    for name, column in zip("txyp", _checked(path, lambda parts: columns(*parts), whole), strict=True):
-        packed[name] = column
-    return packed
+    return packed(*_checked(path, lambda parts: columns(*parts), whole))
 
 
 def _checked(path: Path, look: Any, events: Any) -> Any:

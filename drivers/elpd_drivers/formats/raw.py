@@ -20,12 +20,16 @@ from elpd.events.evt2 import swap_halves
 from elpd.events.registers import MAX_SIDE
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
+from elpd_drivers.formats import raw_write
+from elpd_drivers.formats.raw_write import write_raw
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+__all__ = ["FORMAT", "RawFormat", "RawReader", "write_raw"]
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_LINE_BYTES = 1024
@@ -73,6 +77,19 @@ class RawFormat:
         """Open for reading. Raises ``FormatError`` for an encoding that is not one of the three."""
         return RawReader(path)
 
+    @property
+    def writes(self) -> Mapping[str, str]:
+        """The encodings, all in ``.raw``."""
+        return dict.fromkeys(raw_write.WORDS, ".raw")
+
+    def can_write(self, word: str) -> None:
+        """Nothing beyond numpy is needed."""
+        del word
+
+    def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> raw_write.RawWriter:
+        """Begin a file. Raises ``FormatError`` for a sensor whose addresses do not fit 11 bits."""
+        return raw_write.RawWriter(path, word, geometry, facts)
+
 
 FORMAT = RawFormat()
 
@@ -88,6 +105,8 @@ class RawReader:
         self.encoding, options = _encoding_of(path, header)
         self._notes["format"] = NAMES[self.encoding]
         self._geometry = _geometry_of(header, options, self._warnings)
+        if header.get("complete") == "no":
+            self._warnings.append("the recording was not finished: its disk was full, or its program was stopped")
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
@@ -142,35 +161,6 @@ class RawReader:
         sample = self._file.read(1 << 16)
         words = np.frombuffer(sample[: len(sample) // 8 * 8], "<u8")
         return _time_steps(swap_halves(words)) > _time_steps(words)
-
-
-def write_raw(path: Path, geometry: Geometry, words: Iterable[NDArray[np.uint16]], header: Mapping[str, str]) -> int:
-    """Write EVT3 words to a RAW file that other software reads; return the number of bytes.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    geometry : Geometry
-        The sensor's size.
-    words : iterable of uint16 arrays
-        The payload, piece by piece.
-    header : mapping
-        Further lines, such as ``{"serial_number": "00050567"}``.
-    """
-    lines = {
-        **header,
-        "evt": "3.0",
-        "format": f"EVT3;height={geometry.height};width={geometry.width}",
-        "geometry": f"{geometry.width}x{geometry.height}",
-    }
-    text = "".join(f"% {key} {value}\n" for key, value in lines.items()) + "% end\n"
-    size = 0
-    with path.open("wb") as file:
-        size += file.write(text.encode())
-        for piece in words:
-            size += file.write(np.ascontiguousarray(piece, "<u2").tobytes())
-    return size
 
 
 def _time_steps(words: NDArray[np.uint64]) -> int:
