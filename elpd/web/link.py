@@ -49,7 +49,9 @@ class Connection:
         try:
             reader, writer = await asyncio.open_unix_connection(socket, limit=LINE_LIMIT_BYTES)
         except OSError as error:
-            raise _unavailable(f"no daemon answers at {socket} ({error.strerror or error}); is `elpd serve` running?") from None
+            raise _unavailable(
+                f"no daemon answers at {socket} ({error.strerror or error}); is `elpd serve` running?"
+            ) from None
         return cls(reader, writer, hear)
 
     async def call(self, method: str, params: dict[str, Any] | None = None) -> Any:

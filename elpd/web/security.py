@@ -52,7 +52,9 @@ class Gate:
 
     def judge(self, method: str, path: str, headers: CIMultiDictProxy[str]) -> Refusal | None:
         """Return why this request is refused, or ``None``."""
-        return self._strange_host(headers) or _foreign_page(self.hosts, headers) or self._stranger(method, path, headers)
+        return (
+            self._strange_host(headers) or _foreign_page(self.hosts, headers) or self._stranger(method, path, headers)
+        )
 
     def _strange_host(self, headers: CIMultiDictProxy[str]) -> Refusal | None:
         asked = headers.getall("Host", [])

@@ -47,7 +47,9 @@ def read_or_make_token(path: Path) -> str:
     except FileExistsError:
         return _read(path)  # another gateway was faster
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}; set web.token_file to a place that can be written") from None
+        raise ConfigError(
+            f"{path}: {error.strerror or error}; set web.token_file to a place that can be written"
+        ) from None
     return token
 
 
