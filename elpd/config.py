@@ -89,6 +89,19 @@ class StateSection(_Section):
     """Whether profiles that belong to this rig are used."""
 
 
+class WebSection(_Section):
+    """The page, which is a process of its own (`elpd web`)."""
+
+    host: str = "127.0.0.1"
+    """Where it listens. Anything but the loopback needs *allowed_hosts*, and is not encrypted."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8732
+    """0: any free one."""
+    allowed_hosts: tuple[str, ...] = ()
+    """What browsers may call it beside the loopback's names, such as ``rig.lab:8732``, or ``rig.lab`` behind a proxy."""
+    token_file: Path | None = None
+    """Where the token lies; in the state directory unless given."""
+
+
 class SimSection(_Section):
     """The simulated rig. Everything is drawn from ``seed``; a set key wins over the draw."""
 
@@ -115,6 +128,7 @@ class Config(_Section):
     focus: FocusSection = FocusSection()
     journal: JournalSection = JournalSection()
     state: StateSection = StateSection()
+    web: WebSection = WebSection()
     sim: SimSection = SimSection()
 
 

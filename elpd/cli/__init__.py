@@ -35,6 +35,7 @@ COMMANDS = {
     "sim-board": "a simulated lens controller on a pty",
     "stop": "stop the lens now",
     "temporal-map": "an HDR picture from a recorded aperture opening",
+    "web": "the page, for browsers",
 }
 
 
