@@ -22,6 +22,7 @@ from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
 from elpd_drivers.formats import raw_write
 from elpd_drivers.formats.raw_write import write_raw
+from elpd_drivers.formats.text_header import read_header
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["FORMAT", "RawFormat", "RawReader", "write_raw"]
-
-MAX_HEADER_BYTES = 1 << 16
-MAX_LINE_BYTES = 1024
 
 ENCODINGS = {
     "EVT3": Encoding.EVT3,
@@ -70,7 +68,7 @@ class RawFormat:
 
     def recognises(self, path: Path) -> bool:
         """Say whether the file begins with a header that names an EVT encoding."""
-        header, _ = _read_header(path)
+        header, _ = read_header(path)
         return "evt" in header or header.get("format", "").upper().startswith("EVT")
 
     def open(self, path: Path) -> RawReader:
@@ -99,7 +97,7 @@ class RawReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        header, self._offset = _read_header(path)
+        header, self._offset = read_header(path)
         self._warnings: list[str] = []
         self._notes: dict[str, Any] = {"header": header, "warnings": self._warnings, "lost": 0, "lost_reason": []}
         self.encoding, options = _encoding_of(path, header)
@@ -168,29 +166,6 @@ def _time_steps(words: NDArray[np.uint64]) -> int:
     highs = (words[words >> np.uint64(60) == 0x8] >> np.uint64(32)).astype(np.int64)
     steps = np.diff(highs)
     return int(((steps >= 0) & (steps < 1000)).sum())
-
-
-def _read_header(path: Path) -> tuple[dict[str, str], int]:
-    """Return the header's fields, and where the payload begins."""
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_HEADER_BYTES)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error.strerror}") from error
-    fields: dict[str, str] = {}
-    offset = 0
-    while text[offset : offset + 1] == b"%":
-        end = text.find(b"\n", offset, offset + MAX_LINE_BYTES)
-        line = text[offset + 1 : end].rstrip(b"\r")
-        # Without `% end`, a payload that begins with 0x25 looks like a line until its other bytes are seen.
-        if end < 0 or any(byte < 0x20 or byte == 0x7F for byte in line):
-            break
-        offset = end + 1
-        key, _, value = line.decode("utf-8", "replace").strip().partition(" ")
-        if key == "end":
-            break
-        fields[key.lower()] = value.strip()
-    return fields, offset
 
 
 def _encoding_of(path: Path, header: Mapping[str, str]) -> tuple[Encoding, dict[str, str]]:

@@ -41,7 +41,7 @@ WORDS: dict[str, tuple[Encoding, str, dict[str, str]]] = {
 FIRST_LIMIT_US = 43_200_000_000
 """Half a day: a decoder's turns of the clock are bridged for a day at most (``Evt3Encoder``)."""
 
-NOT_OURS = {"evt", "format", "geometry", "endianness", "complete", "end", "width", "height"}
+NOT_OURS = {"evt", "format", "geometry", "endianness", "complete", "end", "width", "height", "data", "version"}
 KEY = re.compile(r"[A-Za-z][\w.-]*", re.ASCII)
 UNFINISHED, FINISHED = b"no ", b"yes"
 
