@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from elpd.cli.session import focus_once
+from elpd.record.session import focus_once
 from elpd.config import load
 from elpd.focus.settings import FocusRequest
 
