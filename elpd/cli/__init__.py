@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import io
 import sys
+from pathlib import Path
 from typing import ClassVar, cast
 
 import click
@@ -64,9 +65,15 @@ class LazyGroup(click.Group):
 @click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="elpd")
 @click.option("--verbose", "-v", is_flag=True, help="Log what happens, to stderr.")
-def root(*, verbose: bool) -> None:
+@click.option(
+    "--log",
+    "log_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Log to this file too, one JSON object a line.",
+)
+def root(*, verbose: bool, log_file: Path | None) -> None:
     """Real-time autofocus for event cameras."""
-    log.configure(verbose=verbose)
+    log.configure(verbose=verbose, file=log_file)
 
 
 def main() -> None:
