@@ -176,15 +176,6 @@ class SimSection(_Section):
     pace: Annotated[float, Field(ge=0)] = 0.0
 
 
-class ApiSection(_Section):
-    """The socket in front of the daemon."""
-
-    socket: Path | None = None
-    """``/run/elpd/elpd.sock`` where that may be made, else under ``$XDG_RUNTIME_DIR``, unless given."""
-    operators: str | None = None
-    """A group whose members may operate the rig, beside root and the daemon's own user; all others look."""
-
-
 class Config(_Section):
     """Everything."""
 
