@@ -36,6 +36,8 @@ typedef struct {
     uint64_t sync_edges, steps_made;
     step_t steps[LOG];
     uint32_t steps_put, steps_got;
+    step_t syncs[LOG]; /* way: the level after the edge */
+    uint32_t syncs_put, syncs_got;
     sent_t sent[LOG];
     uint32_t sent_put, sent_got;
     uint8_t queue[QUEUE];
@@ -83,6 +85,9 @@ static void on_sync(struct avr_irq_t *irq, uint32_t value, void *param) {
     if ((value != 0) != bench->sync) {
         bench->sync = value != 0;
         bench->sync_edges++;
+        step_t *edge = &bench->syncs[bench->syncs_put++ % LOG];
+        edge->cycle = bench->avr->cycle;
+        edge->way = bench->sync;
     }
 }
 
@@ -232,6 +237,18 @@ uint32_t bench_steps(void *handle, uint64_t *cycles, int32_t *ways, uint32_t roo
         step_t *step = &bench->steps[bench->steps_got++ % LOG];
         cycles[count] = step->cycle;
         ways[count] = step->way;
+    }
+    return count;
+}
+
+/* Copy out the edges on SYNC since the last call, each with the level after it; returns how many. */
+uint32_t bench_syncs(void *handle, uint64_t *cycles, int32_t *levels, uint32_t room) {
+    bench_t *bench = handle;
+    uint32_t count = 0;
+    for (; count < room && bench->syncs_got != bench->syncs_put; count++) {
+        step_t *edge = &bench->syncs[bench->syncs_got++ % LOG];
+        cycles[count] = edge->cycle;
+        levels[count] = edge->way;
     }
     return count;
 }

@@ -53,9 +53,10 @@ TRIES = 3
 class AvrSettings:
     """The table ``[lens]`` for our own controller.
 
-    ``watchdog_ms`` is its dead-man; ``sync_steps`` makes one edge on the sync line every so many steps (0: none), for a
-    camera's trigger input. ``start_stop_um_s`` is the speed from which the motor can halt without losing steps.
-    ``latency_us`` is the usual time from a command's last bit to its effect, adapter included.
+    ``watchdog_ms`` is its dead-man; ``sync_steps`` makes an edge on the sync line at each multiple of so many steps (0:
+    none), which is wired to the camera's trigger input ``sync_channel``: the camera then stamps where the lens was.
+    ``start_stop_um_s`` is the speed from which the motor can halt without losing steps. ``latency_us`` is the usual
+    time from a command's last bit to its effect, adapter included.
     """
 
     port: str = ""
@@ -70,6 +71,7 @@ class AvrSettings:
     homing_slow_um_s: float = 150.0
     homing_ms: int = 30_000
     sync_steps: int = 0
+    sync_channel: int = 0
     query_ms: float = 4.0
     reply_ms: float = 50.0
     watchdog_ms: float = 500.0
@@ -127,6 +129,16 @@ class AvrController:
         self._homing_begun = False
         self._iris: tuple[bool, int] | None = None  # what it was told to be and is not known to be, tries
         self._unconfirmed: tuple[int, bytes, int, int] | None = None  # sequence, frame, stops before it, tries
+
+    @property
+    def mark_every_steps(self) -> int:
+        """How many steps lie between two edges on SYNC."""
+        return self._settings.sync_steps
+
+    @property
+    def mark_channel(self) -> int:
+        """The camera's trigger channel that SYNC is wired to."""
+        return self._settings.sync_channel
 
     @property
     def trouble_bytes(self) -> bytes:
