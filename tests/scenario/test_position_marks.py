@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.skipif(avr.hindrance() is not None, reason=str(avr.hindrance()))
 CRUISE_SPS = 12_000.0
+ADAPTER_NS = 400_000
+"""How long the adapter takes to pass a command on, which nobody has told the driver."""
 
 
 class Listener:
@@ -33,6 +35,8 @@ class Listener:
 def focus(*overrides: str) -> tuple[RigParts, FocusResult]:
     config = load(None, [*SMALL, "sim.board=avr", "sim.seed=11", *overrides])
     parts = rig.build(config)
+    assert isinstance(parts.truth, SimulatedTruth)
+    parts.truth.port.wire._latency_ns = ADAPTER_NS
     return parts, FocusCycle(parts, CycleSettings.from_config(config), FocusRequest(), Listener()).run()
 
 
@@ -51,12 +55,13 @@ def worst_at_speed(parts: RigParts) -> float:
 
 
 @pytest.mark.parametrize("camera", ["evk4", "davis346"])
-def test_marks_are_believed_and_halve_the_error_of_the_lens_own_position(camera: str) -> None:
+def test_with_marks_an_unknown_latency_does_not_matter(camera: str) -> None:
     plain, first = focus(f"sim.camera={camera}")
     marked, second = focus(f"sim.camera={camera}", "sim.sync_steps=64")
     assert first.outcome is second.outcome is Outcome.FOCUSED
     assert not any("trigger input" in warning for warning in second.warnings)
-    assert 0.0 < worst_at_speed(marked) < 0.5 * worst_at_speed(plain)
+    assert worst_at_speed(plain) > 1.0
+    assert worst_at_speed(marked) < 0.2
 
 
 def test_a_wire_that_is_off_is_told_and_does_no_harm() -> None:
