@@ -240,6 +240,8 @@ class Trajectory:
         epoch = self._epochs[index]
         if epoch.reports and _says_nothing_new(epoch, report, when):
             return
+        if epoch.marked and report.moving and report.latest_ns - report.earliest_ns > 2 * MARK_NS:
+            return  # its latency, which all reports share, would outvote the marks
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
@@ -251,9 +253,13 @@ class Trajectory:
 
     def mark(self, steps: float, when_ns: int) -> None:
         """Learn that the motor was at *steps* at *when_ns*, to a microsecond: a mark beside which no latency counts."""
+        index = self._index(when_ns)
+        epoch = self._epochs[index]
+        if not epoch.marked:
+            epoch.marked, epoch.reports = True, []
+            self._follow_from(index)
         half = min(MARK_NS, self._timing.reply_ns)
         self.observe(LensReport(steps, HostNs(when_ns - half), HostNs(when_ns + half), None, LensFlag.MOVING))
-        self._epochs[self._index(when_ns)].marked = True
 
     def resume(self, report: LensReport) -> bool:
         """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
