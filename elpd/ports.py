@@ -298,6 +298,20 @@ class Remarks(Protocol):
 
 
 @runtime_checkable
+class TakesMarks(Protocol):
+    """A lens whose controller makes an edge on a line each time a certain position is reached, wired to the camera."""
+
+    @property
+    def mark_channel(self) -> int | None:
+        """On which of the camera's trigger channels the edges come; ``None`` where nothing is wired."""
+        ...
+
+    def mark(self, when: HostNs) -> bool:
+        """Take an edge that the camera stamped, so at one of those positions; say whether it is believed."""
+        ...
+
+
+@runtime_checkable
 class Closeable(Protocol):
     """Anything to give back at the end."""
 

@@ -122,7 +122,9 @@ class Work:
                 arrival = self._errands(job, parts).home(1000.0 * HOME_LIMIT_S)
             except LensError as error:
                 if job.cancelled:
-                    raise UnreferencedError(f"homing was stopped on request, the lens must be homed again: {error}") from None
+                    raise UnreferencedError(
+                        f"homing was stopped on request, the lens must be homed again: {error}"
+                    ) from None
                 raise
         return HomeAnswer(position_um=arrival.um)
 

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from elpd.errors import ConfigError, DeviceError, FormatError, LensError, UnavailableError, UnreferencedError, UsageError
+from elpd.errors import (
+    ConfigError,
+    DeviceError,
+    FormatError,
+    LensError,
+    UnavailableError,
+    UnreferencedError,
+    UsageError,
+)
 from elpd.records import Outcome, StopMode
 from elpd.service.attention import PAUSE_S
 from elpd.service.engine_port import Answer
@@ -195,7 +203,9 @@ class Worker:
         except Exception as error:
             log.exception("a request failed in a way that it should not")
             self.lost(error)
-            return Answer(error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log"))
+            return Answer(
+                error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log")
+            )
         self._attention.beat()
         if job.request.method == "home":
             self._keeper.needs_home = False
@@ -224,5 +234,3 @@ def _cancelled_before(job: Job) -> Answer:
     fields = {name: None for name in ("focus_um", "sigma_um", "stop_um", "final_um", "stop_latency_us")}
     counted = {"reversals": 0, "duration_ms": 0.0, "phases": [], "events": 0, "lost": 0}
     return Answer(FocusAnswer.model_validate({"outcome": Outcome.CANCELLED.value, "reason": why, **fields, **counted}))
-
-
