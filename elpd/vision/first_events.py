@@ -124,7 +124,7 @@ def sort_few(values: NDArray[np.int32], count: int) -> None:
         values[j] = value
 
 
-@kernel("int64(int32[:, ::1], uint8[:, ::1], int32[:, ::1], uint8[:, ::1], int32[:, :, ::1], float64)")
+@kernel("int64(int32[:, ::1], uint8[:, ::1], int32[:, ::1], uint8[:, ::1], int32[:, :, ::1], float64)", allocates=True)
 def believe(
     times: NDArray[np.int32],
     choice: NDArray[np.uint8],
