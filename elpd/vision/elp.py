@@ -28,7 +28,7 @@ from elpd.events.registers import (
     take_triggers,
 )
 from elpd.records import Encoding
-from elpd.vision import elp_addresses, elp_words
+from elpd.vision import elp_addresses, elp_lanes
 from elpd.vision.elp_weights import weight_table
 from elpd.vision.elp_windows import (
     CURSOR,
@@ -104,16 +104,16 @@ class ElpWindows:
         self._triggers = new_triggers()
         self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
-        self._pending = (np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64))
+        self._pending = elp_lanes.scratch()
         self._words = (
             {
-                Encoding.EVT3: elp_words.evt3_to_windows_capped,
+                Encoding.EVT3: elp_lanes.kernels()[1],
                 Encoding.EVT2: elp_addresses.evt2_to_windows_capped,
                 Encoding.EVT21: elp_addresses.evt21_to_windows_capped,
             }
             if rate_cap
             else {
-                Encoding.EVT3: elp_words.evt3_to_windows,
+                Encoding.EVT3: elp_lanes.kernels()[0],
                 Encoding.EVT2: elp_addresses.evt2_to_windows,
                 Encoding.EVT21: elp_addresses.evt21_to_windows,
             }
