@@ -176,7 +176,7 @@ class ElpWindows:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
         enter_epoch(packet, self._state)
         sum_words = self._words[packet.encoding]
-        scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
+        scratch = (self._bucket, *self._pending)
         words = packet.data
         window = self._window
         window[N_ROWS] = 0
@@ -202,14 +202,15 @@ class ElpWindows:
     ) -> NDArray[Any]:
         """Sum events given as columns of any stride, t int64 or uint32; return the windows closed, as ``feed``."""
         window = self._window
+        scratch = (self._bucket, *self._pending)
         window[N_ROWS] = 0
         position = self._arrays(
-            t, x, y, p, 0, self._table, window, self._edges, self._rows, complete_until_us, self._bucket
+            t, x, y, p, 0, self._table, window, self._edges, self._rows, complete_until_us, *scratch
         )
         while window[PAUSED]:
             self._make_room()
             position = self._arrays(
-                t, x, y, p, position, self._table, window, self._edges, self._rows, complete_until_us, self._bucket
+                t, x, y, p, position, self._table, window, self._edges, self._rows, complete_until_us, *scratch
             )
         return self._closed[: window[N_ROWS]]
 

@@ -19,7 +19,7 @@ from elpd.events.registers import HIGH, LOOP, LOW
 from elpd.vision import elp_words
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import BEGIN, ELP, ENERGY, LENGTH, N_OFF, N_ON, OUT_OF_SENSOR, OUTSIDE, move_to
-from elpd.vision.elp_words import PENDING, SIGNATURE, sum_capped
+from elpd.vision.elp_words import PENDING, SIGNATURE, sum_capped, sum_pending
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,16 +31,23 @@ if TYPE_CHECKING:
 LOWS_IN_HIGH = 4096
 
 
-@kernel()
-def sum_list(lists: NDArray[np.uint32], n: Integer, table: NDArray[np.int16], window: NDArray[np.int64]) -> None:
-    """Add the first *n* events of a list to the open window."""
-    elp, energy, n_inside, n_on, out_of_sensor = weigh(lists, n, table, OUTSIDE_WEIGHT, OUT_OF_SENSOR_WEIGHT)
-    window[ELP] += elp
-    window[ENERGY] += energy
-    window[N_ON] += n_on
-    window[N_OFF] += n_inside - n_on
-    window[OUTSIDE] += n - n_inside
-    window[OUT_OF_SENSOR] += out_of_sensor
+if available():  # elsewhere it does not compile
+
+    @kernel()
+    def _sum_list(lists: NDArray[np.uint32], n: Integer, table: NDArray[np.int16], window: NDArray[np.int64]) -> None:
+        """Add the first *n* events of a list to the open window."""
+        elp, energy, n_inside, n_on, out_of_sensor = weigh(lists, n, table, OUTSIDE_WEIGHT, OUT_OF_SENSOR_WEIGHT)
+        window[ELP] += elp
+        window[ENERGY] += energy
+        window[N_ON] += n_on
+        window[N_OFF] += n_inside - n_on
+        window[OUTSIDE] += n - n_inside
+        window[OUT_OF_SENSOR] += out_of_sensor
+
+    sum_list: Callable[..., None] = _sum_list
+else:
+    sum_list = sum_pending
+"""Adds the first so many events of a list to the open window: the fastest for this processor."""
 
 
 def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
