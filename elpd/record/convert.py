@@ -118,7 +118,7 @@ def convert(
         with appearing_whole(out, force=force) as partial:
             writer = writes.create(partial, word, size, dict(reader.notes.get("header", {})))
             try:
-                answer = _Conversion(reader, writer, part, size).run()
+                answer = Conversion(reader, writer, part, size).run()
             finally:
                 writer.close()
     except OSError as error:
@@ -135,7 +135,7 @@ def convert(
     }
 
 
-class _Conversion:
+class Conversion:
     """One pass from a reader to a writer."""
 
     def __init__(self, reader: RecordingReader, writer: RecordingWriter, part: Slice, geometry: Geometry) -> None:

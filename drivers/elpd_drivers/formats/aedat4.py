@@ -64,6 +64,11 @@ class Aedat4Format:
         """Nothing beyond numpy is needed."""
         del word
 
+    def appends(self, word: str) -> bool:
+        """Say yes: packets follow packets."""
+        del word
+        return True
+
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> aedat4_write.Aedat4Writer:
         """Begin a file."""
         del word

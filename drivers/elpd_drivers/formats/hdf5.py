@@ -67,6 +67,11 @@ class Hdf5Format:
         del word
         return None if _h5py() is not None else NO_H5PY
 
+    def appends(self, word: str) -> bool:
+        """Say no: HDF5 keeps its own books."""
+        del word
+        return False
+
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> hdf5_write.Hdf5Writer:
         """Begin a file."""
         return hdf5_write.Hdf5Writer(path, geometry, facts, ecf=word == "hdf5")

@@ -58,8 +58,8 @@ class Hdf5Writer:
 
     @property
     def traits(self) -> WriterTraits:
-        """Events and trigger edges; a file whose disk was full may not be readable."""
-        return WriterTraits(triggers=True, appends=False)
+        """Events and trigger edges, of any time."""
+        return WriterTraits(triggers=True)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -64,6 +64,10 @@ class NpyFormat:
         """Nothing beyond numpy is needed."""
         del word
 
+    def appends(self, word: str) -> bool:
+        """Say so of ``npy``: an archive is put together at the end."""
+        return word == "npy"
+
     def create(
         self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]
     ) -> npy_write.NpyWriter | npy_write.NpzWriter:

@@ -75,8 +75,8 @@ class NpzWriter:
 
     @property
     def traits(self) -> WriterTraits:
-        """Events alone, of any time; nothing is readable before the end."""
-        return WriterTraits(appends=False)
+        """Events alone, of any time."""
+        return WriterTraits()
 
     @property
     def warnings(self) -> tuple[str, ...]:
