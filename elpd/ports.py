@@ -458,15 +458,13 @@ class WriterTraits:
 
     ``encoding`` names the raw words that are taken as they are, beside arrays, ``None`` where there are none;
     ``triggers`` and ``frames`` say what else is kept. ``first_limit_us`` is the largest time that the first event may
-    have (``None``: any). ``appends`` says that what was written is readable at any moment, so that a full disk costs
-    only what comes after.
+    have (``None``: any).
     """
 
     encoding: Encoding | None = None
     triggers: bool = False
     frames: bool = False
     first_limit_us: int | None = None
-    appends: bool = True
 
 
 class RecordingWriter(Protocol):
@@ -506,6 +504,10 @@ class WritableFormat(Protocol):
 
     def can_write(self, word: str) -> str | None:
         """Say what is missing to write *word* here (a package, as a line to type), ``None`` if nothing is."""
+        ...
+
+    def appends(self, word: str) -> bool:
+        """Say whether what was written is readable at any moment: then a full disk costs only what comes after."""
         ...
 
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> RecordingWriter:

@@ -31,6 +31,7 @@ COMMANDS = {
     "home": "find the lens's reference",
     "jog": "move the lens by so much",
     "move": "move the lens to a place",
+    "record": "what the camera sees, to a file; nothing moves",
     "replay": "run a recorded cycle again, to the same decision",
     "sim-board": "a simulated lens controller on a pty",
     "stop": "stop the lens now",
