@@ -58,9 +58,10 @@ while IFS="=" read -r inside outside; do
     [ -n "$inside" ] || continue
     mkdir -p "./$inside"; mount --bind "$outside" "./$inside"; mount -o remount,bind,ro "./$inside"
 done <"$BINDS"
-chroot . systemd-sysusers
+mkdir -p mnt; pivot_root . mnt; umount -l mnt  # not chroot: from inside one no user namespace can be made
+cd /; systemd-sysusers
 export container=tests
-exec chroot . /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
+exec /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
 """
 
 _TRIAL = """
@@ -218,7 +219,8 @@ class Booted:
             path.write_text(content, encoding="utf-8")
             path.chmod(0o755 if content.startswith("#!") else 0o644)
         (files / "opt/elpd/bin").mkdir(parents=True, exist_ok=True)
-        (files / f"opt/elpd/bin/{PYTHON}").symlink_to(f"/opt/python/bin/{PYTHON}")
+        for name in ("python3", PYTHON):
+            (files / "opt/elpd/bin" / name).symlink_to(f"/opt/python/bin/{PYTHON}")
         for folder in files.rglob("*"):
             if folder.is_dir():
                 folder.chmod(0o755)
