@@ -195,6 +195,56 @@ class PixelMask(Protocol):
 
 
 @runtime_checkable
+class TriggerInput(Protocol):
+    """A camera with an input for edges, which it stamps with its own clock and delivers in its packets."""
+
+    def enable_trigger(self, *, on: bool) -> None:
+        """Listen to the input, or do not."""
+        ...
+
+
+@runtime_checkable
+class RateLimit(Protocol):
+    """A camera whose sensor can be told to send no more than so many events; what it drops, it counts."""
+
+    def limit_rate(self, mev_s: float | None) -> None:
+        """Send that many million events a second at most, or all with ``None``."""
+        ...
+
+
+@runtime_checkable
+class Temperature(Protocol):
+    """A camera that knows how warm its sensor is."""
+
+    def temperature_c(self) -> float:
+        """Return the temperature in degrees Celsius."""
+        ...
+
+
+@runtime_checkable
+class Counters(Protocol):
+    """A camera that counts what it delivered and what was lost on the way."""
+
+    @property
+    def counters(self) -> Mapping[str, float]:
+        """What was counted since it was opened, by name. Never waits."""
+        ...
+
+
+@runtime_checkable
+class Reopens(Protocol):
+    """A camera that can come back after it was lost, without being built anew."""
+
+    def reopen(self) -> bool:
+        """Take one step towards being open again, never waiting; say whether it is.
+
+        Call it now and then; between two attempts it lets time pass, more each time, and says no. Raises
+        ``CameraError`` with the reason when an attempt failed. Once open, ``start`` delivers.
+        """
+        ...
+
+
+@runtime_checkable
 class Latency(Protocol):
     """A camera that knows how long its data take at the least, from pixel to host."""
 
