@@ -60,6 +60,7 @@ while IFS="=" read -r inside outside; do
 done <"$BINDS"
 mkdir -p mnt; pivot_root . mnt; umount -l mnt  # not chroot: from inside one no user namespace can be made
 cd /; systemd-sysusers
+[ ! -d /var/cache/elpd ] || chown -R elpd:elpd /var/cache/elpd
 export container=tests
 exec /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
 """
@@ -119,6 +120,20 @@ def installation() -> tuple[dict[str, str], dict[str, Path]]:
     return files, binds
 
 
+def compiled_kernels() -> dict[str, Path]:
+    """Return where the service keeps kernels, for each that lies compiled in this checkout: it need not begin cold.
+
+    A kernel belongs to its source by that file's time and size, which a bind keeps, and to its folder by name.
+    """
+    from numba.core.caching import _CacheLocator  # noqa: PLC0415
+
+    found = {}
+    for path in [*ROOT.glob("elpd/**/__pycache__/*.nb?"), *ROOT.glob("drivers/**/__pycache__/*.nb?")]:
+        source = Path("/opt/source", path.parents[1].relative_to(ROOT), "any.py")
+        found[f"var/cache/elpd/numba/{_CacheLocator.get_suitable_cache_subpath(str(source))}/{path.name}"] = path
+    return found
+
+
 def _installed() -> dict[str, str]:
     """Return what tools/install puts outside of the virtual environment."""
     with tempfile.TemporaryDirectory() as folder:
@@ -132,10 +147,13 @@ class Booted:
     """A booted systemd. Call it with a command line to run that inside, as root.
 
     *files* maps paths inside to their text (``#!`` makes them executable), *binds* paths inside to folders outside,
-    read-only.
+    read-only, *copies* paths inside to files outside.
     """
 
-    def __init__(self, files: Mapping[str, str], binds: Mapping[str, Path]) -> None:
+    def __init__(
+        self, files: Mapping[str, str], binds: Mapping[str, Path], copies: Mapping[str, Path] | None = None
+    ) -> None:
+        self._copies = dict(copies or {})
         self._files = {
             "etc/systemd/system/tests.target": _TARGET,
             **{f"etc/systemd/system/{name}.timer": "" for name in _MASKED},  # an empty file masks
@@ -218,6 +236,9 @@ class Booted:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content, encoding="utf-8")
             path.chmod(0o755 if content.startswith("#!") else 0o644)
+        for name, outside in self._copies.items():
+            (files / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(outside, files / name)
         (files / "opt/elpd/bin").mkdir(parents=True, exist_ok=True)
         for name in ("python3", PYTHON):
             (files / "opt/elpd/bin" / name).symlink_to(f"/opt/python/bin/{PYTHON}")
