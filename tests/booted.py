@@ -209,7 +209,7 @@ class Booted:
         arguments = [*self._inside(), "journalctl", "--no-pager", "--lines=60", "--output=short-monotonic"]
         return subprocess.run(arguments, capture_output=True, text=True, check=False, cwd="/", env=_ENV).stdout
 
-    def until(self, holds: Callable[[], Any], what: str, within_s: float = 20.0) -> Any:
+    def until(self, holds: Callable[[], Any], what: str, within_s: float = 120.0) -> Any:
         """Ask until *holds* returns something true, and return that; an ``AssertionError`` with the journal if late."""
         deadline = time.monotonic() + within_s
         while not (answer := holds()):

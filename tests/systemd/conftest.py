@@ -10,9 +10,11 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-QUIET = """
-import pathlib, time
-from elpd.records import Geometry
+STRANGER = """
+import os, pathlib, time
+import numpy as np
+from elpd.records import CameraPacket, Encoding, Geometry
+from elpd_drivers.lenses import tic
 
 class QuietCamera:
     geometry = Geometry(64, 48)
@@ -22,24 +24,42 @@ class QuietCamera:
     def stop(self): pass
 
     def read(self, timeout_s):
-        while pathlib.Path("/run/elpd/hang").exists():
+        time.sleep(min(timeout_s, 0.02))
+        return CameraPacket(np.empty(0, "<u2"), Encoding.EVT3, time.monotonic_ns())
+
+class StickyLens:
+    def __init__(self, lens): self._lens = lens
+
+    def __getattr__(self, name): return getattr(self._lens, name)
+
+    def poll(self):
+        told = pathlib.Path("/run/elpd/hang")
+        if told.exists() and told.read_text().strip() == str(os.getpid()):
             hang_where_nobody_expects_it()
-        time.sleep(timeout_s)
-        return None
+        return self._lens.poll()
 
 def hang_where_nobody_expects_it():
     time.sleep(3600)
 
 def open_camera(settings, clock):
     return QuietCamera()
+
+def open_lens(settings, clock):
+    return StickyLens(tic.open_lens(settings, clock))
+"""
+ENTRY_POINTS = """
+[elpd.cameras]
+quiet = stranger:open_camera
+[elpd.lenses]
+sticky = stranger:open_lens
 """
 PACKAGES = f"opt/elpd/lib/{booted.PYTHON}/site-packages"
-QUIET_CAMERA = {
-    f"{PACKAGES}/quiet_camera.py": QUIET,
-    f"{PACKAGES}/quiet_camera-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: quiet-camera\nVersion: 1\n",
-    f"{PACKAGES}/quiet_camera-1.dist-info/entry_points.txt": "[elpd.cameras]\nquiet = quiet_camera:open_camera\n",
+STRANGERS_DRIVERS = {
+    f"{PACKAGES}/stranger.py": STRANGER,
+    f"{PACKAGES}/stranger-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: stranger\nVersion: 1\n",
+    f"{PACKAGES}/stranger-1.dist-info/entry_points.txt": ENTRY_POINTS,
 }
-"""A stranger's camera that sees nothing, and hangs while /run/elpd/hang is there."""
+"""A camera that sees nothing, and a Tic whose driver hangs in the process that /run/elpd/hang names."""
 
 
 @pytest.fixture(scope="session")
@@ -47,5 +67,5 @@ def machine() -> Iterator[booted.Booted]:
     if (missing := booted.why_not()) is not None:
         pytest.skip(missing)
     files, binds = booted.installation()
-    with booted.Booted(files | QUIET_CAMERA, binds, booted.compiled_kernels()) as running:
+    with booted.Booted(files | STRANGERS_DRIVERS, binds, booted.compiled_kernels()) as running:
         yield running

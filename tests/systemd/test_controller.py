@@ -7,29 +7,36 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from elpd.cli import COMMANDS
+
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Iterator
 
     from booted import Booted
 
-pytestmark = pytest.mark.xdist_group("systemd")
+pytestmark = [
+    pytest.mark.xdist_group("systemd"),
+    pytest.mark.skipif("serve" not in COMMANDS, reason="there is no daemon in this version"),
+]
 
 CONFIG = """
 rig = "hardware"
 [camera]
 driver = "quiet"
 [lens]
-driver = "tic"
+driver = "sticky"
 port = "{port}"
 min_um = 0.0
-max_um = 4000.0
-speed_um_s = 250.0
+max_um = 16000.0
+speed_um_s = 800.0
 watchdog_ms = 60000
 reply_ms = 2000
 """
-"""Slow, so that there is time to be killed in. The board's own dead-man is put off: it cannot have been that. Replies may
-be late, because the board is a process among many."""
+"""A long way, so that there is time to be killed on. The board's own dead-man is put off: it cannot have been that.
+Replies may be late, because the board is a process among many."""
+
+CAP_SYS_RESOURCE = 1 << 24
 
 CLIENT = """
 import json, socket, sys
@@ -45,7 +52,16 @@ class Controller:
 
     def __init__(self, machine: Booted) -> None:
         self.machine = machine
-        board = ("/opt/elpd/bin/elpd", "sim-board", "tic", "--json", "--set", "board.travel_um=4000")
+        board = (
+            "/opt/elpd/bin/elpd",
+            "sim-board",
+            "tic",
+            "--json",
+            "--set",
+            "board.travel_um=16000",
+            "--set",
+            "board.start_um=500",
+        )
         machine("systemd-run", "--unit=lens", "--property=User=elpd", *board)
         told = machine.until(lambda: machine.journal("-u", "lens", "_TRANSPORT=stdout"), "the board's port")
         self.port = json.loads(told[0]["MESSAGE"])["port"]
@@ -60,8 +76,7 @@ class Controller:
         )
 
     def call(self, method: str, user: str = "root", **params: Any) -> dict[str, Any]:
-        asked = self.client(method, user, **params)
-        told, _ = asked.communicate(timeout=30)
+        told, _ = self.client(method, user, **params).communicate(timeout=120)
         answer: dict[str, Any] = json.loads(told)
         return answer
 
@@ -77,16 +92,30 @@ class Controller:
         return self.machine.journal("-u", "elpd", *matches)
 
     def ready(self) -> None:
-        """Begin anew, with the lens homed."""
-        self.machine("systemctl", "reset-failed", "elpd.service", "elpd.socket", check=False)
-        self.configure(CONFIG.format(port=self.port))
-        self.machine("systemctl", "restart", "elpd")
+        """Run as configured, the lens homed."""
+        text = CONFIG.format(port=self.port)
+        as_configured = self.machine("cat", "/etc/elpd/elpd.toml").stdout == text
+        if not as_configured or self.show("ActiveState") != ["active"]:
+            self.machine("systemctl", "reset-failed", "elpd.service", "elpd.socket", check=False)
+            self.configure(text)
+            self.machine("systemctl", "restart", "elpd")
         if not self.status()["lens"]["referenced"]:
-            assert "result" in self.call("home")
+            answer = self.call("home")
+            assert "result" in answer, answer
+
+    def resting(self) -> dict[str, Any]:
+        """Return the lens once it is known to be at rest."""
+
+        def lens() -> dict[str, Any] | None:
+            found: dict[str, Any] = self.status()["lens"]
+            return found if found["moving"] is False else None
+
+        at_rest: dict[str, Any] = self.machine.until(lens, "the lens to rest")
+        return at_rest
 
     def moving(self) -> subprocess.Popen[str]:
         """Return the request of a long move that is on its way."""
-        asked = self.client("move", to_um=3000.0)
+        asked = self.client("move", to_um=15900.0)
         self.machine.until(lambda: self.status()["lens"]["moving"], "the lens to move")
         return asked
 
@@ -139,17 +168,23 @@ def test_the_lens_is_driven_from_inside_the_sandbox(controller: Controller) -> N
     assert answer["position_um"] == pytest.approx(was_um + 25.0, abs=0.5)
 
 
-def test_the_focus_thread_is_urgent_and_its_memory_stays(controller: Controller) -> None:
+def proc_status(machine: Booted, pid: str) -> dict[str, str]:
+    lines = machine("cat", f"/proc/{pid}/status").stdout.splitlines()
+    return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
+
+
+def test_the_focus_thread_is_urgent_and_its_memory_stays_where_that_may_be(controller: Controller) -> None:
     (pid,) = controller.show("MainPID")
-    policies = {
-        line.split(maxsplit=1)[0]: line.split()[1:]
-        for line in controller.machine("ps", "-L", "-o", "cls,rtprio,comm", "-p", pid).stdout.splitlines()[1:]
-    }
-    assert policies["FF"][0] == "10"
-    status = controller.machine("cat", f"/proc/{pid}/status").stdout
-    locked_kb = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmLck"))
-    assert locked_kb > 0
-    assert not any(warned["code"] == "not-real-time" for warned in controller.status()["warnings"])
+    threads = controller.machine("ps", "-L", "-o", "cls=,rtprio=", "-p", pid).stdout.splitlines()
+    process, systemd = (proc_status(controller.machine, number) for number in (pid, "1"))
+    warned = any(warned["code"] == "not-real-time" for warned in controller.status()["warnings"])
+    if int(systemd["CapEff"], 16) & CAP_SYS_RESOURCE:
+        assert [thread.split() for thread in threads].count(["FF", "10"]) == 1
+        assert int(process["VmLck"].split()[0]) > 0
+        assert not warned
+    else:  # nobody here gets what LimitRTPRIO= and LimitMEMLOCK= ask for: then it works all the same, and says so
+        assert not any("FF" in thread for thread in threads)
+        assert warned
 
 
 def test_nothing_else_is_in_its_reach(controller: Controller) -> None:
@@ -162,21 +197,22 @@ def test_nothing_else_is_in_its_reach(controller: Controller) -> None:
         "/home:\n\n/root:",
         "/home:\n/root:",
     }
-    assert "lo" in controller.machine(*inside, "cat", "/proc/net/dev", check=False).stdout
-    assert "eth" not in controller.machine(*inside, "cat", "/proc/net/dev", check=False).stdout
+    links = controller.machine("nsenter", "-t", pid, "-n", "ip", "-oneline", "link").stdout.splitlines()
+    assert [link.split()[1] for link in links] == ["lo:"]
 
 
 def test_killed_in_mid_move_the_lens_is_stopped_and_nothing_moves_after(controller: Controller) -> None:
+    restarts = int(controller.show("NRestarts")[0])
     begun = len(controller.journal("ELPD_EVENT=rig open"))
     asked = controller.moving()
     controller.machine("systemctl", "kill", "--signal=KILL", "--kill-whom=main", "elpd")
     controller.machine.until(lambda: len(controller.journal("ELPD_EVENT=rig open")) > begun, "the controller's return")
-    assert asked.wait(timeout=10) is not None
-    assert controller.show("Result", "NRestarts") == ["success", "1"]
+    asked.communicate(timeout=120)
+    assert int(controller.show("NRestarts")[0]) > restarts
     assert any("at rest" in line["MESSAGE"] for line in controller.journal("_TRANSPORT=stdout"))
-    lens = controller.status()["lens"]
-    assert (lens["moving"], lens["referenced"]) == (False, False)
-    assert lens["position_um"] < 2500.0
+    lens = controller.resting()
+    assert not lens["referenced"]
+    assert lens["position_um"] < 15000.0
     refused = controller.call("move", to_um=100.0)
     assert refused["error"]["kind"] == "Unreferenced"
     assert controller.status()["lens"]["position_um"] == lens["position_um"]
@@ -186,16 +222,18 @@ def test_killed_in_mid_move_the_lens_is_stopped_and_nothing_moves_after(controll
 def test_a_hang_ends_in_a_traceback_that_names_it_and_a_restart(controller: Controller) -> None:
     begun = len(controller.journal("ELPD_EVENT=rig open"))
     asked = controller.moving()
-    controller.machine("touch", "/run/elpd/hang")
+    controller.machine.write("/run/elpd/hang", controller.show("MainPID")[0])
     controller.machine.until(lambda: controller.journal("ELPD_EVENT=focus thread hangs"), "the supervisor's stop")
-    controller.machine.until(lambda: controller.show("NRestarts") == ["1"], "the watchdog")
-    controller.machine("rm", "/run/elpd/hang")
+    restarts = int(controller.show("NRestarts")[0])
+    controller.machine.until(lambda: int(controller.show("NRestarts")[0]) > restarts, "the watchdog")
     controller.machine.until(lambda: len(controller.journal("ELPD_EVENT=rig open")) > begun, "the controller's return")
     told = "\n".join(line["MESSAGE"] for line in controller.journal("_TRANSPORT=stdout"))
     assert "Fatal Python error: Aborted" in told
     assert "in hang_where_nobody_expects_it" in told
-    assert asked.wait(timeout=10) is not None
-    assert controller.status()["lens"]["moving"] is False
+    asked.communicate(timeout=120)
+    lens = controller.resting()
+    assert not lens["referenced"]
+    assert lens["position_um"] < 15000.0
 
 
 def test_a_configuration_that_is_wrong_is_refused_and_the_old_one_stays(controller: Controller) -> None:
@@ -207,13 +245,13 @@ def test_a_configuration_that_is_wrong_is_refused_and_the_old_one_stays(controll
     (refused, *_) = controller.machine.until(
         lambda: controller.journal("PRIORITY=4", "ELPD_EVENT=configuration refused, the old one stays"), "the refusal"
     )
-    assert "/etc/elpd/elpd.toml:12: focus.deadlin_ms: unknown key" in refused["ELPD_REASON"]
+    assert "/etc/elpd/elpd.toml:14: focus.deadlin_ms: unknown key" in refused["ELPD_REASON"]
     assert any(warned["code"] == "config-refused" for warned in controller.status()["warnings"])
     assert controller.status()["lens"]["limits_um"] == limits
-    controller.configure(text.replace("max_um = 4000.0", "max_um = 3500.0"))
+    controller.configure(text.replace("max_um = 16000.0", "max_um = 15000.0"))
     controller.machine("systemctl", "reload", "elpd")
     controller.machine.until(lambda: controller.journal("ELPD_EVENT=configuration reloaded"), "the new configuration")
-    controller.machine.until(lambda: controller.status()["lens"]["limits_um"] == [0.0, 3500.0], "the new limits")
+    controller.machine.until(lambda: controller.status()["lens"]["limits_um"] == [0.0, 15000.0], "the new limits")
     assert controller.show("MainPID", "ActiveState") == [pid, "active"]
 
 
@@ -236,9 +274,8 @@ def test_a_crash_loop_ends_and_the_lens_is_left_alone(controller: Controller) ->
     )
     controller.machine("systemctl", "daemon-reload")
     controller.machine("systemctl", "restart", "elpd", check=False)
-    controller.machine.until(lambda: controller.show("ActiveState") == ["failed"], "the end of the loop", 30)
+    controller.machine.until(lambda: controller.show("ActiveState") == ["failed"], "the end of the loop")
     assert controller.show("Result", "NRestarts") == ["signal", "5"]
-    assert "Start request repeated too quickly." in {line["MESSAGE"] for line in controller.journal()}
     controller.machine("rm", "-r", "/run/systemd/system/elpd.service.d")
     controller.machine("systemctl", "daemon-reload")
     controller.ready()
