@@ -17,6 +17,7 @@ _REGISTER, _WRITE, _FAILED = 0x10102, 0x40000000, 0x80000000
 _ADC_STATUS, _ADC_DONE = 0x50, 1 << 11
 _TIME_BASE, _ROI_CONTROL, _OUT_OF_RESET = 0x9008, 0x4, 1 << 10
 ROI_X, ROI_Y, DIGITAL_MASK = 0x2000, 0x4000, 0x9100
+RATE_ENABLE, RATE_EVENTS, BIAS_DIFF_ON = 0x6028, 0x600C, 0x1010
 
 
 def _string(text: str) -> bytes:
@@ -46,8 +47,9 @@ class Evk4:
         self.registers: dict[int, int] = {}
         self.writes = 0
         self.answering = threading.Event()
-        """While cleared, register reads of the temperature get no answer: the host waits."""
+        """While cleared, frames get no answer and the host waits."""
         self.answering.set()
+        self._answer_then = False
         self._serial = bytes.fromhex(serial)[::-1]
         self._replies: deque[bytes] = deque()
         self._stream: deque[bytes] = deque()
@@ -55,6 +57,10 @@ class Evk4:
     def send(self, packet: bytes) -> None:
         """Queue a USB packet of events; one that is longer than the host asks for goes in several."""
         self._stream.append(packet)
+
+    def answer_when_sent(self) -> None:
+        """Answer frames again once the host has taken every packet of events."""
+        self._answer_then = True
 
     @property
     def streaming(self) -> bool:
@@ -92,6 +98,9 @@ class Evk4:
 
     def next_packet(self, endpoint: int, length: int) -> bytes | None:
         """Return a reply or a packet of events."""
+        if self._answer_then and not self._stream:
+            self._answer_then = False
+            self.answering.set()
         if endpoint == CONTROL_IN:
             return self._replies.popleft() if self._replies and self.answering.is_set() else None
         if not self._stream or not self.streaming:

@@ -8,6 +8,7 @@ reaps them, as the kernel does. The protocol is the preload library's: three mac
 
 from __future__ import annotations
 
+import ctypes.util
 import errno
 import shutil
 import socket
