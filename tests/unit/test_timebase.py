@@ -2,7 +2,7 @@ import random
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elpd.timebase import SensorClock
@@ -65,6 +65,7 @@ def error_us(clock: SensorClock, t_us: int, drift: float) -> float:
     return abs(clock.to_host(SensorUs(t_us)) / 1000 - t_us * (1 + drift))
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 2**32),
     st.floats(-100e-6, 100e-6),
