@@ -376,12 +376,14 @@ class FoundDevice:
     """Something that is plugged in: a serial port, a camera on the USB.
 
     ``next_step`` says what a person must do before it can be used, ``None`` where nothing stands in the way.
+    ``drivers`` are the installed entry points that would open it, as far as that can be told without opening it.
     """
 
     kind: str
     name: str
     where: str
     next_step: str | None = None
+    drivers: tuple[str, ...] = ()
 
 
 class Discovery(Protocol):
