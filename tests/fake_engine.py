@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from elpd.errors import BusyError
 from elpd.service.engine_port import Answer, Caller, ClientCounts, Request
@@ -18,6 +18,7 @@ from elpd.service.messages import (
     LensStatus,
     MetricsAnswer,
     MoveAnswer,
+    Params,
     Status,
     StopAnswer,
 )
@@ -68,18 +69,21 @@ class FakeEngine:
         self.requests: list[Request] = []
         self.accepted: list[FakeTicket] = []
         self.departed: list[Caller] = []
+        self.changes: dict[str, Any] = {}
+        """What the status says otherwise than usual."""
         self.beats = 0
         self.counts = ClientCounts()
         self.listeners: list[Callable[[Event], None]] = []
         self._changed = threading.Condition()
 
     def status(self) -> Status:
-        return Status(
+        status = Status(
             state="READY", mode="one-shot", phase=None, fault=None, lens=LensStatus(driver="fake"),
             camera=CameraStatus(driver="fake"), aperture=None, roi=None, lease=LeaseAnswer(holder=None, until_s=0.0),
             last=None, warnings=[], counters=Counters(clients=self.counts.clients), latency={}, ticks={}, uptime_s=1.0,
             rss_mb=1.0, version="0", rig="fake",
         )  # fmt: skip
+        return status.model_copy(update=self.changes)
 
     def submit(self, request: Request) -> FakeTicket:
         ticket = FakeTicket(request)
@@ -120,6 +124,10 @@ class FakeEngine:
     def note_clients(self, counts: ClientCounts) -> None:
         self.counts = counts
         self._note("counted")
+
+    def begin(self, method: str) -> None:
+        """Let something run that no client has asked for."""
+        self.submit(Request(method, Params(), Caller(0, 0, 0, "")))
 
     # --- for the test ---------------------------------------------------------------------------------------------
 

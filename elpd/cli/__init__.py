@@ -20,7 +20,9 @@ from elpd.errors import ElpdError
 
 COMMANDS = {
     "calibrate": "measure the rig itself: aperture, backlash, lens, sensor",
+    "cancel": "end what the daemon runs",
     "check": "what is installed, what is plugged in, and does it work",
+    "clear": "clear the daemon's latched fault",
     "decode": "what an event file holds",
     "demo": "focus the embedded simulated rig, live in the terminal",
     "detect": "the causal detector over a recorded sweep",
@@ -28,9 +30,14 @@ COMMANDS = {
     "focus": "one focus cycle",
     "home": "find the lens's reference",
     "jog": "move the lens by so much",
+    "lease": "keep the rig for oneself",
+    "mode": "when the daemon focuses by itself",
     "move": "move the lens to a place",
+    "preset": "places of the lens that the daemon remembers",
     "replay": "run a recorded cycle again, to the same decision",
+    "roi": "the daemon's regions",
     "sim-board": "a simulated lens controller on a pty",
+    "status": "how the daemon and its rig are",
     "stop": "stop the lens now",
     "temporal-map": "an HDR picture from a recorded aperture opening",
 }
