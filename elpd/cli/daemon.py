@@ -90,15 +90,23 @@ def naming_the_holder() -> Iterator[None]:
         raise BusyError(f"{error}; a daemon runs (process {pid}): leave out --foreground, or stop it") from None
 
 
-def answer_of(pending: Pending) -> Any:
-    """Wait for an answer; Ctrl-C cancels what was asked for and still tells how it ended, a second one gives up."""
+def ask(client: Client, method: str, params: dict[str, Any]) -> Any:
+    """Ask and wait; Ctrl-C cancels what was asked for and still tells how it ended, a second one gives up."""
+    pending: Pending | None = None
+    pressed = False
 
     def cancel(*_: object) -> None:
+        nonlocal pressed
+        pressed = True
         signal.signal(signal.SIGINT, previous)
-        pending.cancel()
+        if pending is not None:
+            pending.cancel()
 
-    previous = signal.signal(signal.SIGINT, cancel)
+    previous = signal.signal(signal.SIGINT, cancel)  # before anything is asked: no press is lost
     try:
+        pending = client.begin(method, params)
+        if pressed:
+            pending.cancel()
         return pending.result(LONGEST_S)
     finally:
         signal.signal(signal.SIGINT, previous)

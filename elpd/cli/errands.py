@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from elpd.cli.common import config_options, interruptible, json_option, print_json
-from elpd.cli.daemon import answer_of, daemon_unless, naming_the_holder, socket_option
+from elpd.cli.daemon import ask, daemon_unless, naming_the_holder, socket_option
 from elpd.errors import UsageError
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def _by_daemon(client: Client, method: str, params: dict[str, Any]) -> dict[str,
     """Ask the daemon, and it for the lens before and after: a STOP goes out before anything is asked."""
     before = None if method == "stop" else client.status()["lens"]
     begun_s = time.monotonic()
-    answer = answer_of(client.begin(method, params))
+    answer = ask(client, method, params)
     duration_ms = 1e3 * (time.monotonic() - begun_s)
     lens = client.status()["lens"]
     return {

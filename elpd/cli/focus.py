@@ -80,7 +80,7 @@ def _from_here(
     request = FocusRequest(
         roi=region or _configured_roi(config), reference=_reference_path(reference, config), dry_run=dry_run
     )
-    from elpd.cli.session import focus_once  # noqa: PLC0415  (numba, after the request is known to be well formed)
+    from elpd.record.session import focus_once  # noqa: PLC0415  (numba, after the request is known to be well formed)
 
     with interruptible() as cancelled, naming_the_holder():
         session = focus_once(config, request, view, cancelled)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from elpd.cli.daemon import answer_of
+from elpd.cli.daemon import ask
 from elpd.records import ElpSample, FocusResult, Outcome, PhaseTime
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def focus_by(
     if view is not None:
         asked = {"events": ["phase", "sample"], "rate_hz": RATE_HZ}
         client.begin("subscribe", asked, _shown_in(view)).result(client.timeout_s)
-    fields: dict[str, Any] = answer_of(client.begin("focus", params))
+    fields: dict[str, Any] = ask(client, "focus", params)
     if view is not None:
         view.result(_result(fields))
     if fields.get("truth") is None:

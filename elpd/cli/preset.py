@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from elpd.cli.common import print_json
-from elpd.cli.daemon import answer_of, daemon_options, reach
+from elpd.cli.daemon import ask, daemon_options, reach
 from elpd.errors import UsageError
 
 
@@ -19,7 +19,7 @@ def command(*, action: str, name: str | None, as_json: bool, **where: Any) -> in
     """List the presets, save this place under NAME, go to NAME, or forget it."""
     if (action == "list") != (name is None):
         raise UsageError(f"preset {action}: {'takes no NAME' if action == 'list' else 'takes a NAME'}")
-    answer = answer_of(reach(**where).begin("preset", {"action": action} | ({} if name is None else {"name": name})))
+    answer = ask(reach(**where), "preset", {"action": action} | ({} if name is None else {"name": name}))
     if as_json:
         print_json(answer)
         return 0
