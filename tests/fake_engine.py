@@ -68,9 +68,12 @@ class FakeEngine:
         self.calls: list[str] = []
         self.requests: list[Request] = []
         self.accepted: list[FakeTicket] = []
+        self.waiting: list[FakeTicket] = []
         self.departed: list[Caller] = []
         self.changes: dict[str, Any] = {}
         """What the status says otherwise than usual."""
+        self.patient = False
+        """Whether to answer nothing before the test says so."""
         self.beats = 0
         self.counts = ClientCounts()
         self.listeners: list[Callable[[Event], None]] = []
@@ -92,6 +95,8 @@ class FakeEngine:
             if any(other.answer is None for other in self.accepted):
                 raise BusyError("something runs")
             self.accepted.append(ticket)
+        elif self.patient:
+            self.waiting.append(ticket)
         else:
             ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
         self._note(request.method)
@@ -120,6 +125,7 @@ class FakeEngine:
     def beat(self, loop: str) -> None:
         assert loop == "api"
         self.beats += 1
+        self._note("beat")
 
     def note_clients(self, counts: ClientCounts) -> None:
         self.counts = counts
@@ -139,6 +145,11 @@ class FakeEngine:
         ticket = self.accepted[-1]
         moved = MoveAnswer(position_um=10.0, sigma_um=0.1)
         ticket.finish(Answer(focus_answer(outcome) if ticket.request.method == "focus" else moved))
+
+    def finish_all(self) -> None:
+        """Answer what was asked and waits, in that order."""
+        for ticket in self.waiting:
+            ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
 
     def heard(self, what: Callable[[], bool], limit_s: float = 10.0) -> None:
         """Wait until the engine has heard what the test waits for."""

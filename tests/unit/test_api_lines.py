@@ -127,42 +127,44 @@ def test_what_may_be_urgent_is_seen() -> None:
 @given(st.lists(st.tuples(st.integers(1, 40), st.booleans(), st.integers(0, 2))))
 def test_what_waits_is_bounded_and_in_order_and_answers_are_kept(pushed: list[tuple[int, bool, int]]) -> None:
     box = Outbox(bound_bytes=100)
-    kept: list[bytes] = []
+    told: list[bytes] = []
     answers: list[bytes] = []
-    dropped = samples = 0
-    for number, (size, droppable, taken) in enumerate(pushed):
-        line = f"{number} ".encode().ljust(size, b"x")
-        said = box.push(line, droppable=droppable)
+    dropped = 0
+    for seq, (size, droppable, taken) in enumerate(pushed, 1):
+        line = f"{seq} ".encode().ljust(size, b"x")
+        said = box.push(line, droppable=droppable, seq=seq)
         if said < 0:
             assert not droppable
             assert sum(map(len, answers)) > 100
             return  # the client is dropped
         dropped += said
-        samples += droppable
         if not droppable:
             answers.append(line)
         for _ in range(taken):
             out = box.pop()
             if out is not None:
-                kept.append(out)
+                told.append(out)
                 if out in answers:
                     answers.remove(out)
         assert box.waiting_bytes <= 100 + max((len(line) for line in answers), default=0)
     while (out := box.pop()) is not None:
-        kept.append(out)
-    numbers = [int(line.split()[0]) for line in kept]
-    assert numbers == sorted(numbers)
-    assert {number for number, (_, droppable, _) in enumerate(pushed) if not droppable} <= set(numbers)
-    assert len(pushed) - len(kept) == dropped == box.take_dropped()
-    assert box.take_dropped() == box.waiting_bytes == len(box) == 0
+        told.append(out)
+    gaps = [json.loads(line) for line in told if b"dropped" in line]
+    kept = [int(line.split()[0]) for line in told if b"dropped" not in line]
+    numbers = [json.loads(line)["seq"] if b"dropped" in line else int(line.split()[0]) for line in told]
+    assert numbers == sorted(set(numbers))
+    assert {seq for seq, (_, droppable, _) in enumerate(pushed, 1) if not droppable} <= set(kept)
+    assert len(pushed) - len(kept) == dropped == sum(gap["count"] for gap in gaps)
+    assert box.waiting_bytes == len(box) == 0
 
 
 def test_the_oldest_samples_go_first() -> None:
     box = Outbox(bound_bytes=30)
     for line in (b"first sample", b"an answer", b"next one"):
-        box.push(line, droppable=line != b"an answer")
+        box.push(line, droppable=line != b"an answer", seq=7)
     assert box.push(b"newest", droppable=True) == 1
-    assert [box.pop(), box.pop(), box.pop()] == [b"an answer", b"next one", b"newest"]
+    gap = b'{"event":"dropped","seq":7,"count":1}\n'
+    assert [box.pop(), box.pop(), box.pop(), box.pop()] == [gap, b"an answer", b"next one", b"newest"]
 
 
 def test_one_large_answer_may_wait_and_a_second_may_not() -> None:
