@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from elpd.errors import BusyError, UsageError
+from elpd.errors import UsageError
 from elpd.records import Geometry, Roi
 
 if TYPE_CHECKING:
@@ -51,18 +51,6 @@ def report_error(kind: str, message: str, *, as_json: bool) -> None:
     if as_json:
         print_json({"outcome": None, "error": {"kind": kind, "message": message}})
     print(f"elpd: {message}", file=sys.stderr)
-
-
-def from_here(*, foreground: bool, config_path: Path | None, overrides: tuple[str, ...]) -> None:
-    """Refuse to touch the rig from this process unless it was asked for: a daemon may hold it.
-
-    Raises ``BusyError`` when neither a daemon answers nor a configuration says which rig is meant.
-    """
-    if not (foreground or config_path or overrides):
-        raise BusyError(
-            "no daemon answers; start one, or work from this process with --foreground (the simulated rig), "
-            "--config FILE or --set KEY=VALUE"
-        )
 
 
 @contextmanager
