@@ -13,7 +13,7 @@ import structlog
 
 from elpd import rig
 from elpd.calibrate.profile import state_directory
-from elpd.errors import FaultLatchedError, LensError, UnavailableError, UnreferencedError, UsageError
+from elpd.errors import FaultLatchedError, UnavailableError, UnreferencedError, UsageError
 from elpd.records import Cancel, StopMode
 from elpd.service import archive
 from elpd.service.attention import Attention
@@ -26,7 +26,6 @@ from elpd.service.job import Job, Place
 from elpd.service.keeper import RigKeeper
 from elpd.service.kept import Kept
 from elpd.service.lease import Lease
-from elpd.service.metrics import exposition
 from elpd.service.messages import (
     CancelAnswer,
     ClearAnswer,
@@ -36,6 +35,7 @@ from elpd.service.messages import (
     StopAnswer,
     operates,
 )
+from elpd.service.metrics import exposition
 from elpd.service.pictures import Album
 from elpd.service.situation import Situation
 from elpd.service.work import Work
@@ -158,7 +158,7 @@ class RigEngine:
         return self.situation.listen(listener)
 
     def gone(self, caller: Caller) -> None:
-        """A connection has ended."""
+        """Hear that a connection has ended."""
         self.lease.gone(caller)
         for job in self.place.jobs():
             params = job.request.params
@@ -169,7 +169,7 @@ class RigEngine:
                 job.cancel()
 
     def beat(self, loop: str) -> None:
-        """A loop outside lives."""
+        """Hear that a loop outside lives."""
         self.heartbeats.beat(loop)
 
     def note_clients(self, counts: ClientCounts) -> None:
@@ -290,7 +290,7 @@ class RigEngine:
             self.album.keep_frame(packet.frames[-1], position_um)
         if parts is not None:
             self.album.keep_events(events, parts.camera.geometry, position_um)
-            self.autopilot.hear(packet, events)
+            self.autopilot.hear(events)
 
     def _remember(self) -> None:
         """Begin with what was kept."""
