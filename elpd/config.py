@@ -92,6 +92,19 @@ class StateSection(_Section):
     """Whether profiles that belong to this rig are used."""
 
 
+class WebSection(_Section):
+    """The page, which is a process of its own (`elpd web`)."""
+
+    host: str = "127.0.0.1"
+    """Where it listens. Anything but the loopback needs *allowed_hosts*, and is not encrypted."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8732
+    """0: any free one."""
+    allowed_hosts: tuple[str, ...] = ()
+    """What browsers may call it beside the loopback's names, such as ``rig.lab:8732``, or ``rig.lab`` (a proxy's)."""
+    token_file: Path | None = None
+    """Where the token lies; in the state directory unless given."""
+
+
 class ServiceSection(_Section):
     """The daemon: how it idles and how it is scheduled."""
 
@@ -174,6 +187,7 @@ class Config(_Section):
     journal: JournalSection = JournalSection()
     state: StateSection = StateSection()
     sim: SimSection = SimSection()
+    web: WebSection = WebSection()
     service: ServiceSection = ServiceSection()
     api: ApiSection = ApiSection()
     modes: ModesSection = ModesSection()

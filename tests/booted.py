@@ -106,7 +106,7 @@ def why_not() -> str | None:
 def installation() -> tuple[dict[str, str], dict[str, Path]]:
     """Return (files, read-only binds) that make /opt/elpd and the units as tools/install would."""
     packages = sysconfig.get_path("purelib")
-    files = {
+    files = _installed() | {
         "opt/elpd/pyvenv.cfg": "home = /opt/python/bin\ninclude-system-site-packages = false\n",
         f"opt/elpd/lib/{PYTHON}/site-packages/here.pth": "/opt/source\n/opt/source/drivers\n/opt/packages\n",
         "opt/elpd/bin/elpd": _PROGRAM,
@@ -116,6 +116,15 @@ def installation() -> tuple[dict[str, str], dict[str, Path]]:
     }
     binds = {"opt/python": Path(sys.base_prefix), "opt/packages": Path(packages), "opt/source": ROOT}
     return files, binds
+
+
+def _installed() -> dict[str, str]:
+    """Return what tools/install puts outside of the virtual environment."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, ROOT / "tools" / "install", "--no-venv", "--root", folder]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        found = [path for path in Path(folder).rglob("*") if path.is_file()]
+        return {str(path.relative_to(folder)): path.read_text(encoding="utf-8") for path in found}
 
 
 class Booted:

@@ -22,6 +22,7 @@ from elpd.errors import ElpdError
 COMMANDS = {
     "calibrate": "measure the rig itself: aperture, backlash, lens, sensor",
     "check": "what is installed, what is plugged in, and does it work",
+    "convert": "an event file in another format, or a part of one",
     "decode": "what an event file holds",
     "demo": "focus the embedded simulated rig, live in the terminal",
     "detect": "the causal detector over a recorded sweep",
@@ -34,6 +35,7 @@ COMMANDS = {
     "sim-board": "a simulated lens controller on a pty",
     "stop": "stop the lens now",
     "temporal-map": "an HDR picture from a recorded aperture opening",
+    "web": "the page, for browsers",
 }
 
 
