@@ -57,6 +57,9 @@ FOCUS_LOOP = "focus"
 DEVICE_METHODS = frozenset({"focus", "home", "move", "jog", "record"})
 """Methods that need the focus thread; so does ``preset`` where it moves the lens."""
 
+RIG_SECTIONS = ("rig", "camera", "lens", "aperture", "sim", "state")
+"""What a rig is made of: another one of these is another rig."""
+
 WITHOUT_REFERENCE = frozenset({"home", "record"})
 """What a lens that does not know where it is may be asked for."""
 
@@ -190,16 +193,22 @@ class RigEngine:
         self._save()
         self.situation.began()
 
-    def reload(self, config: Config) -> None:
-        """Take another configuration, as soon as nothing is being done."""
+    def reload(self, config: Config, done: Callable[[], None] = lambda: None) -> None:
+        """Take another configuration, as soon as nothing is being done; *done* is called then.
+
+        The rig is opened anew only if what it is made of has changed. State, once read, stays where it was.
+        """
 
         def change() -> None:
+            other = any(getattr(config, part) != getattr(self.config, part) for part in RIG_SECTIONS)
             self.config = self.keeper.config = config
-            self.situation.configured(config)
             self._idle.reconfigure(config.service)
             self.autopilot.reconfigure(config)
-            self.worker.reopen()
-            log.info("configuration reloaded")
+            if other:
+                self.worker.reopen()
+                self.situation.configured(config)
+            log.info("configuration reloaded", rig_reopened=other)
+            done()
 
         self.worker.reload = change
         self.place.ring()
@@ -301,7 +310,7 @@ class RigEngine:
             self.situation.warn("state-damaged", self._kept.complaint)
             log.warning("state damaged", reason=self._kept.complaint)
         if kept.open:
-            log.warning("the daemon before ended badly; the lens must be homed")
+            log.warning("daemon ended badly before")
 
     def _save(self) -> None:
         try:

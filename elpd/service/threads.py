@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 FOCUS_LIMIT_S = 1.0
 """The focus thread beats every few milliseconds; silent for so long it hangs."""
 
+API_LOOP = "api"
+API_LIMIT_S = 1.5
+"""The socket's loop beats four times a second."""
+
 LOOK_EVERY_S = 0.1
 """How often the supervisor looks."""
 
@@ -89,7 +93,7 @@ class EngineThreads:
         try:
             self._engine.step()
         except Exception as error:
-            log.exception("the focus thread failed in a way that it should not")
+            log.exception("focus thread failed")
             self._engine.worker.lost(error)
 
     def _supervise(self) -> None:
@@ -106,7 +110,7 @@ class EngineThreads:
     def _stop_for(self, silent_s: float) -> None:
         """Stop the lens of a focus thread that hangs: the bytes first."""
         failure = self._engine.keeper.stop_lens(StopMode.ABRUPT)
-        why = f"the focus thread gave no sign of life for {silent_s:.1f} s (limit {FOCUS_LIMIT_S:g}); the lens was stopped"
+        why = f"the focus thread was silent for {silent_s:.1f} s (limit {FOCUS_LIMIT_S:g}); the lens was stopped"
         if failure is not None:
             why = f"{why}, or should have been: {failure}"
         log.error("focus thread hangs", silent_s=silent_s, limit_s=FOCUS_LIMIT_S)

@@ -147,7 +147,7 @@ class Worker:
                 parts = self._keeper.open(now_s)
         except (DeviceError, ConfigError, FormatError) as error:
             if self._situation.latch(error.kind, str(error)):
-                log.error("fault latched", kind=error.kind, reason=str(error))  # noqa: TRY400  (said, not traced)
+                log.error("fault latched", kind=error.kind, reason=str(error), lens=None)  # noqa: TRY400  (said, not traced)
             return
         self._time.follow(parts.clock)
         self._attention.follow(parts.clock)
@@ -171,7 +171,7 @@ class Worker:
 
     def _after_pause(self, passed_s: float) -> None:
         """Forget the scene: the machine slept. The lens is asked anew before anything moves."""
-        log.warning("the process stood still", seconds=passed_s)
+        log.warning("process stood still", seconds=passed_s)
         self._situation.warn("paused", f"this process stood still for {passed_s:.1f} s while nothing moved")
         self._autopilot.forget()
 
@@ -202,7 +202,7 @@ class Worker:
             self.lost(error)
             return Answer.failed(error)
         except Exception as error:
-            log.exception("a request failed in a way that it should not")
+            log.exception("request failed")
             self.lost(error)
             return Answer(
                 error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log")
