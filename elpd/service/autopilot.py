@@ -250,7 +250,6 @@ class Autopilot:
             blocked=self._blocked(),
             focused_once=self._focused_once,
             loss=None if evidence is None else evidence.loss,
-            certain=evidence is not None and evidence.certain,
             defocused=self._defocused,
             quiet_s=0.0 if evidence is None else evidence.quiet_s,
             since_s=self._since_s,

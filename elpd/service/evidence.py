@@ -1,10 +1,13 @@
 """Has the picture lost sharpness since it was focused? The events of a lens at rest say so.
 
 The Event Laplacian Product is the rate at which sharpness changes, whatever changes it, so its sum over a lens at rest
-is the sharpness gained or lost since: by drift, by a knock, or because another subject stands there, whose picture has
-nothing to do with the one that was focused. How much matters is known from the sweep itself: what the same sum was over
-the last depths of focus before it. Noise makes a random walk of the sum; its variance is the sum of the squared
-weights, so a loss counts once it stands ``SIGMAS`` above that. Pixels that fire by themselves are found by their
+is the sharpness lost since: by drift, by a knock, or because another subject stands there, whose picture has nothing to
+do with the one that was focused. How much matters is known from the sweep itself: what the same sum was over the last
+depths of focus before it.
+
+Over minutes noise would sum to more than that. So only changes are counted that noise would not make: those that stand
+``SIGMAS`` above the random walk of the time that they took, which may be a tenth of a second or several. What is slower
+than that is not heard; a schedule or a temperature is for it. Pixels that fire by themselves are told by their
 neighbours and left out.
 
 Listening now and then misses what happens in between: only changes that were heard count.
@@ -12,6 +15,7 @@ Listening now and then misses what happens in between: only changes that were he
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,21 +32,26 @@ if TYPE_CHECKING:
     from elpd.vision.reference import Reference
 
 SIGMAS = 6.0
-"""By chance once in 10⁹ looks; a thousand times more often if the noise is a thousand looks long: once in ten days."""
+"""Noise alone does this once in 5·10⁸ looks: with seven lengths of time, ten times a second, once in 80 days."""
 
 BIN_S = 0.1
 """Events are summed over so long before they are judged."""
 
-STIR_SHARE = 0.1
+SPANS = (1, 2, 4, 8, 16, 32, 64)
+"""Over how many bins a change may take place."""
+
+AFTERGLOW_S = 0.3
+"""So long after the lens has come to rest, pixels may still answer to what was before."""
+
 STIR_SIGMAS = 4.0
-"""A scene is not quiet while one bin changes its sharpness by this share of what counts as lost, beyond noise."""
+"""A scene in which one bin changes the sharpness by more than this is not quiet; by chance once in an hour."""
 
 MOST_WAITING = 1 << 20
 """Events that may wait for the end of a bin; a scene that sends more is not quiet anyway, and bins end sooner."""
 
 
 class Evidence:
-    """Sharpness since the last focus, over one region.
+    """Sharpness lost since the last focus, over one region.
 
     Parameters
     ----------
@@ -57,26 +66,20 @@ class Evidence:
         self._roi = roi
         self._weights = reference.weights[rows, columns].astype(np.float64)
         self._allowance = allowance
-        self._net = np.zeros(self._weights.shape, np.int64)
-        self._count = np.zeros(self._weights.shape, np.int64)
         self._waiting: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self._waiting_events = 0
+        self._hot = np.zeros(self._weights.shape, np.bool_)
+        self._bins: deque[tuple[float, float]] = deque(maxlen=SPANS[-1])
+        self._lost = 0.0
         self._bin_begun_s: float | None = None
-        self._high = self._total = 0.0
-        self._energy = self._energy_at_high = 0.0
         self._stirred_s: float | None = None
         self._begun_s: float | None = None
         self._now_s = 0.0
 
     @property
     def loss(self) -> float:
-        """How much was lost since the sharpest, in allowances."""
-        return (self._high - self._total) / self._allowance
-
-    @property
-    def certain(self) -> bool:
-        """Whether noise alone would not show so much."""
-        return self._high - self._total > SIGMAS * float(np.sqrt(max(0.0, self._energy - self._energy_at_high)))
+        """How much sharpness was certainly lost, in allowances."""
+        return self._lost / self._allowance
 
     @property
     def quiet_s(self) -> float:
@@ -85,10 +88,12 @@ class Evidence:
         return 0.0 if since is None else self._now_s - since
 
     def hear(self, events: EventArrays, now_s: float) -> None:
-        """Take a packet's events."""
+        """Take a packet's events, heard at *now_s*."""
         self._now_s = now_s
         if self._begun_s is None:
             self._begun_s = now_s
+        if now_s - self._begun_s < AFTERGLOW_S:
+            return
         if self._bin_begun_s is None:
             self._bin_begun_s = now_s
         roi = self._roi
@@ -103,19 +108,27 @@ class Evidence:
         pixel = np.concatenate([one for one, _ in self._waiting])
         sign = np.concatenate([one for _, one in self._waiting])
         self._waiting, self._waiting_events, self._bin_begun_s = [], 0, None
-        size, shape = self._net.size, self._net.shape
-        count = np.bincount(pixel, minlength=size).reshape(shape)
-        net = np.rint(np.bincount(pixel, weights=sign, minlength=size)).astype(np.int64).reshape(shape)
-        self._count += count
-        self._net += net
-        weights = np.where(hot_pixels(self._count), 0.0, self._weights)
-        stirred = abs(float((weights * net).sum()))
-        if stirred > STIR_SHARE * self._allowance and stirred**2 > STIR_SIGMAS**2 * float((weights**2 * count).sum()):
+        count = np.bincount(pixel, minlength=self._weights.size).reshape(self._weights.shape)
+        self._hot |= hot_pixels(count)
+        weight = np.where(self._hot, 0.0, self._weights).ravel()[pixel]
+        lost, variance = float(weight @ sign), float(weight @ weight)
+        if lost**2 > STIR_SIGMAS**2 * variance:
             self._stirred_s = self._now_s
-        self._total = -float((weights * self._net).sum())
-        self._energy = float((weights**2 * self._count).sum())
-        if self._total >= self._high:
-            self._high, self._energy_at_high = self._total, self._energy
+        self._bins.append((lost, variance))
+        self._judge()
+
+    def _judge(self) -> None:
+        """Count the change over the shortest time in which it is one, if there is any."""
+        newest_first = np.array(self._bins)[::-1]
+        sums = newest_first.cumsum(axis=0)
+        for span in SPANS:
+            if span > len(sums):
+                return
+            lost, variance = sums[span - 1]
+            if lost**2 > SIGMAS**2 * variance:
+                self._lost = max(0.0, self._lost + float(lost))
+                self._bins.clear()
+                return
 
 
 def allowance_of(passage: Sequence[ElpSample], depth_of_focus_um: float, depths: float) -> float | None:

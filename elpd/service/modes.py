@@ -29,8 +29,8 @@ FOUND_AGAIN = 0.5
 class View:
     """What a decision rests on. Times are seconds of one clock.
 
-    ``loss`` is how much sharpness was lost, 1 being what counts as out of focus; ``certain`` says that noise alone
-    would not show so much. ``defocused`` is the decision of before. ``since_s`` is the end of the last cycle, or when
+    ``loss`` is how much sharpness was certainly lost, 1 being what counts as out of focus. ``defocused`` is the
+    decision of before. ``since_s`` is the end of the last cycle, or when
     the mode was chosen. ``strikes`` counts cycles in a row that were of no use, ``failures`` those that did not even
     find focus.
     """
@@ -40,7 +40,6 @@ class View:
     blocked: str | None = None
     focused_once: bool = False
     loss: float | None = None
-    certain: bool = False
     defocused: bool = False
     quiet_s: float = 0.0
     since_s: float = 0.0
@@ -101,7 +100,7 @@ def is_defocused(view: View) -> bool:
         return False
     if view.defocused:
         return view.loss > FOUND_AGAIN
-    return view.certain and view.loss > 1.0
+    return view.loss > 1.0
 
 
 def hold_off_s(view: View, patience: Patience) -> float:
