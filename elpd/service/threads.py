@@ -54,6 +54,7 @@ class EngineThreads:
         self._engine = engine
         self._notifier = notifier
         self._prepare = prepare
+        self._watch = Supervisor(engine, notifier)
         self._ready = threading.Event()
         self._end = threading.Event()
         self._focus = threading.Thread(target=self._run, name="elpd-focus", daemon=True)
@@ -97,15 +98,27 @@ class EngineThreads:
             self._engine.worker.lost(error)
 
     def _supervise(self) -> None:
-        stopped = False
         pause_s = min(LOOK_EVERY_S, self._notifier.watchdog_s / 4 or LOOK_EVERY_S)
         while not self._end.wait(pause_s):
-            late = self._engine.heartbeats.late()
-            if FOCUS_LOOP in late and not stopped:
-                self._stop_for(late[FOCUS_LOOP])
-            stopped = FOCUS_LOOP in late
-            if not late:
-                self._notifier.alive()
+            self._watch.look()
+
+
+class Supervisor:
+    """Looks whether every loop lives; stops the lens of a focus thread that does not, once."""
+
+    def __init__(self, engine: RigEngine, notifier: Notifier) -> None:
+        self._engine = engine
+        self._notifier = notifier
+        self._stopped = False
+
+    def look(self) -> None:
+        """Look once."""
+        late = self._engine.heartbeats.late()
+        if FOCUS_LOOP in late and not self._stopped:
+            self._stop_for(late[FOCUS_LOOP])
+        self._stopped = FOCUS_LOOP in late
+        if not late:
+            self._notifier.alive()
 
     def _stop_for(self, silent_s: float) -> None:
         """Stop the lens of a focus thread that hangs: the bytes first."""

@@ -152,6 +152,11 @@ class Worker:
         self._time.follow(parts.clock)
         self._attention.follow(parts.clock)
         self._idle.opened(parts)
+        try:
+            self._idle.meet(parts, needs_home=self._keeper.needs_home and parts.lens.capabilities.homing)
+        except LensError as error:
+            self.lost(error)
+            return
         self._autopilot.opened()
         homes = parts.lens.capabilities.homing
         if self._keeper.needs_home and not homes:

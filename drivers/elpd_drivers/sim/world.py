@@ -75,7 +75,7 @@ class World:
             self._keep_pace()
 
     def leap_to(self, when: HostNs) -> None:
-        """Let time pass in one step, for hours in which nobody listens: what is written meanwhile arrives at its end."""
+        """Let time pass in one step, for hours in which nobody listens; what is under way arrives at its end."""
         if when > self._now:
             self._now = when
             for actor in self._actors:
