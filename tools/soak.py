@@ -7,9 +7,9 @@
 The engine is the daemon's own, stepped without threads; hours in which nobody listens are leapt over. Focus is knocked
 away while the camera listens, and the daemon is expected to find it again by itself. At random people ask for things,
 cables are pulled, boards are reset, the process is stopped for a while or killed, the configuration is read again, the
-state is damaged. What must hold is asserted all along: every request has exactly one answer, the lens stays inside its
-limits and rests when nothing is done, a fault is latched until it is cleared, nothing moves by itself after one, FOCUSED
-means in focus, and the memory stays as it is.
+state is damaged. All along it is asserted that every request has exactly one answer and that the lens stays inside its
+limits and rests when nothing is done; the figures tell how many cycles found focus, how far from the truth, and whether
+the memory grew.
 """
 
 from __future__ import annotations
