@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from elpd.errors import UsageError
 from elpd.service import store
-from elpd.service.messages import ModeName, Preset, RoiBox
+from elpd.service.messages import ModeName, Preset, RoiBox  # noqa: TC001  (pydantic asks for them at run time)
 
 if TYPE_CHECKING:
     from pathlib import Path
