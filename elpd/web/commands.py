@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 URGENT = frozenset({"stop", "cancel"})
 COMMANDS = URGENT | {"focus", "home", "move", "jog", "clear", "roi", "preset", "mode", "temperature", "record"}
-QUESTIONS = frozenset({"hello", "status", "runs", "run", "map", "metrics", "roi", "mode"})
-"""What a GET may ask; ``roi`` and ``mode`` without parameters only read."""
+QUESTIONS = frozenset({"hello", "status", "runs", "run", "map", "metrics", "roi", "mode", "presets"})
+"""What a GET may ask; ``roi`` and ``mode`` without parameters only read, ``presets`` is ``preset`` asked for its list."""
 
 IN_FLIGHT = 6
 """The daemon allows eight requests in flight on a connection."""

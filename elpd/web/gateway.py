@@ -128,7 +128,8 @@ async def _question(request: web.Request) -> web.StreamResponse:
         return _error(404, "UsageError", f"there is no question {method!r}; there are {', '.join(sorted(QUESTIONS))}")
     if method in COMMANDS and request.query:
         return _error(405, "UsageError", f"{method} with parameters is a command; commands are sent with POST")
-    answer = await request.app[DESK].question(method, _query(request))
+    asked = ("preset", {"action": "list"}) if method == "presets" else (method, _query(request))
+    answer = await request.app[DESK].question(*asked)
     if method == "map":
         return _picture(answer)
     if method == "metrics":

@@ -157,7 +157,7 @@ class Relay:
 
     def _hear(self, event: dict[str, Any]) -> None:
         kind = str(event["event"])
-        if kind == "phase" and not self._in_cycle:
+        if kind == "phase" and not self._in_cycle and event.get("phase") not in {"idle", "done"}:
             self._in_cycle, self._cycle_from = True, self._last + 1
         elif kind == "result":
             self._in_cycle = False
