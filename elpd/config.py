@@ -7,10 +7,11 @@ sections are open tables on purpose: their keys belong to the driver, which chec
 from __future__ import annotations
 
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from elpd.errors import ConfigError
 
@@ -76,6 +77,8 @@ class JournalSection(_Section):
     directory: Path = Path("runs")
     enabled: bool = True
     keep: Annotated[int, Field(ge=1)] = 50
+    budget_mb: Positive = 4000.0
+    """How much all runs together may occupy; the oldest go first."""
     memory_mb: Positive = 256.0
     """How much may wait in memory while the lens moves; past it the run's journal ends, marked truncated."""
 
@@ -97,9 +100,64 @@ class WebSection(_Section):
     port: Annotated[int, Field(ge=0, le=65535)] = 8732
     """0: any free one."""
     allowed_hosts: tuple[str, ...] = ()
-    """What browsers may call it beside the loopback's names, such as ``rig.lab:8732``, or ``rig.lab`` behind a proxy."""
+    """What browsers may call it beside the loopback's names, such as ``rig.lab:8732``, or ``rig.lab`` (a proxy's)."""
     token_file: Path | None = None
     """Where the token lies; in the state directory unless given."""
+
+
+class ServiceSection(_Section):
+    """The daemon: how it idles and how it is scheduled."""
+
+    poll_ms: Positive = 20.0
+    """How often an idle lens is asked where it is."""
+    look_s: Positive = 0.1
+    """How long an idle camera is listened to at a time."""
+    look_every_s: Annotated[float, Field(ge=0)] | None = None
+    """How often; 0 is all the time. Unless given, a simulated camera (each millisecond is computed) is listened to
+    once a second, any other all the time, and in continuous mode either is all the time."""
+    priority: Annotated[int, Field(ge=0, le=99)] = 10
+    """SCHED_FIFO priority of the focus thread, where it may have one; 0: none."""
+
+
+class ApiSection(_Section):
+    """The socket."""
+
+    socket: Path | None = None
+    """``/run/elpd/elpd.sock`` where that folder can be written, else ``$XDG_RUNTIME_DIR/elpd/elpd.sock``."""
+    operators: str | None = None
+    """A group whose members may operate, beside root and the daemon's own user; whoever else gets in may look."""
+
+
+class ModesSection(_Section):
+    """When the daemon focuses by itself."""
+
+    start: Literal["one-shot", "continuous", "manual", "scheduled"] = "one-shot"
+    """The mode of a daemon that has none stored."""
+    period_s: Annotated[float, Field(ge=1, le=604_800)] = 600.0
+    """Scheduled mode: from the end of one cycle to the beginning of the next."""
+    hold_off_s: Positive = 2.0
+    """Continuous mode: the least time between two cycles; doubled after each that did not find focus, to 64 times."""
+    settle_s: Positive = 0.3
+    """Continuous mode: so long the scene must have been quiet before the lens moves."""
+    defocus_dof: Annotated[float, Field(ge=1, le=20)] = 2.0
+    """Continuous mode: what counts as out of focus, in depths of focus; half of it counts as in focus again."""
+
+
+class TemperatureSection(_Section):
+    """What temperature does to focus: rows of (celsius, um), celsius ascending; empty: nothing is compensated."""
+
+    table: tuple[tuple[float, float], ...] = ()
+    step_um: Positive | None = None
+    """Moves are made once this much is due: half a depth of focus unless given."""
+    max_step_um: Positive = 50.0
+    """A single reading moves the lens no further than this."""
+
+    @field_validator("table")
+    @classmethod
+    def _ascends(cls, table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        if len(table) == 1 or any(after[0] <= before[0] for before, after in pairwise(table)):
+            raise ValueError("takes two rows or more, celsius ascending")
+        return table
 
 
 class SimSection(_Section):
@@ -128,8 +186,12 @@ class Config(_Section):
     focus: FocusSection = FocusSection()
     journal: JournalSection = JournalSection()
     state: StateSection = StateSection()
-    web: WebSection = WebSection()
     sim: SimSection = SimSection()
+    web: WebSection = WebSection()
+    service: ServiceSection = ServiceSection()
+    api: ApiSection = ApiSection()
+    modes: ModesSection = ModesSection()
+    temperature: TemperatureSection = TemperatureSection()
 
 
 def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:

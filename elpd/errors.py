@@ -12,7 +12,8 @@
     │   │   └── UnreferencedError   the lens does not know where it is
     │   └── FaultLatchedError       a fault of before has not been cleared
     ├── BusyError             somebody else holds the rig (exit code 4)
-    │   └── UnavailableError        the daemon is starting or going down
+    │   ├── UnavailableError        the daemon is starting or going down
+    │   └── UnreachableError        no daemon answers
     ├── ForbiddenError        the caller may look, not touch (exit code 4)
     ├── TooLargeError         a message past its limit (exit code 2)
     └── ReplayDiverged        a recorded run did not replay to the same calls
@@ -85,6 +86,10 @@ class UnavailableError(BusyError):
     """The daemon is starting or going down."""
 
     kind = "Unavailable"
+
+
+class UnreachableError(BusyError):
+    """No daemon answers, or not in time."""
 
 
 class ForbiddenError(ElpdError):

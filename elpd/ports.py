@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         BiasSet,
         CameraPacket,
         CommandStamp,
+        Encoding,
         FocusResult,
         Geometry,
         LensCapabilities,
@@ -194,6 +195,56 @@ class PixelMask(Protocol):
 
 
 @runtime_checkable
+class TriggerInput(Protocol):
+    """A camera with an input for edges, which it stamps with its own clock and delivers in its packets."""
+
+    def enable_trigger(self, *, on: bool) -> None:
+        """Listen to the input, or do not."""
+        ...
+
+
+@runtime_checkable
+class RateLimit(Protocol):
+    """A camera whose sensor can be told to send no more than so many events; what it drops, it counts."""
+
+    def limit_rate(self, mev_s: float | None) -> None:
+        """Send that many million events a second at most, or all with ``None``."""
+        ...
+
+
+@runtime_checkable
+class Temperature(Protocol):
+    """A camera that knows how warm its sensor is."""
+
+    def temperature_c(self) -> float:
+        """Return the temperature in degrees Celsius."""
+        ...
+
+
+@runtime_checkable
+class Counters(Protocol):
+    """A camera that counts what it delivered and what was lost on the way."""
+
+    @property
+    def counters(self) -> Mapping[str, float]:
+        """What was counted since it was opened, by name. Never waits."""
+        ...
+
+
+@runtime_checkable
+class Reopens(Protocol):
+    """A camera that can come back after it was lost, without being built anew."""
+
+    def reopen(self) -> bool:
+        """Take one step towards being open again, never waiting; say whether it is.
+
+        Call it now and then; between two attempts it lets time pass, more each time, and says no. Raises
+        ``CameraError`` with the reason when an attempt failed. Once open, ``start`` delivers.
+        """
+        ...
+
+
+@runtime_checkable
 class Latency(Protocol):
     """A camera that knows how long its data take at the least, from pixel to host."""
 
@@ -233,6 +284,16 @@ class Outputs(Protocol):
 
     def set_output(self, name: str, *, on: bool) -> CommandStamp:
         """Switch an output. Raises ``UsageError`` if there is none of that name, ``LensError`` if it cannot be now."""
+        ...
+
+
+@runtime_checkable
+class Remarks(Protocol):
+    """A device that notices what a person should change about how it is connected."""
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """Whole sentences: what was measured, what is expected, what to do; none where all is well."""
         ...
 
 
@@ -374,4 +435,68 @@ class RecordingFormat(Protocol):
 
     def open(self, path: Path) -> RecordingReader:
         """Open for reading. Raises ``FormatError`` with what was found and what was expected."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class WriterTraits:
+    """What a file being written can hold.
+
+    ``encoding`` names the raw words that are taken as they are, beside arrays, ``None`` where there are none;
+    ``triggers`` and ``frames`` say what else is kept. ``first_limit_us`` is the largest time that the first event may
+    have (``None``: any). ``appends`` says that what was written is readable at any moment, so that a full disk costs
+    only what comes after.
+    """
+
+    encoding: Encoding | None = None
+    triggers: bool = False
+    frames: bool = False
+    first_limit_us: int | None = None
+    appends: bool = True
+
+
+class RecordingWriter(Protocol):
+    """An event file being written, in bounded memory."""
+
+    @property
+    def traits(self) -> WriterTraits:
+        """What it can hold."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Sentences about what could not be written as it was, so far."""
+        ...
+
+    def write(self, packet: CameraPacket) -> None:
+        """Append a packet: an array of events, or words of ``traits.encoding``, with its triggers and frames.
+
+        Raises ``FormatError`` for what the format cannot say, ``OSError`` when there is no room; what was written
+        before stays whole, and ``close`` may follow.
+        """
+        ...
+
+    def close(self, *, complete: bool = True) -> None:
+        """Finish the file. Idempotent. ``complete=False`` leaves it marked as cut short, where that can be said."""
+        ...
+
+
+@runtime_checkable
+class WritableFormat(Protocol):
+    """A ``RecordingFormat`` that can be written too; asked for once."""
+
+    @property
+    def writes(self) -> Mapping[str, str]:
+        """The words of ``--format`` that this writes, and each one's usual suffix; first the preferred one."""
+        ...
+
+    def can_write(self, word: str) -> str | None:
+        """Say what is missing to write *word* here (a package, as a line to type), ``None`` if nothing is."""
+        ...
+
+    def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> RecordingWriter:
+        """Begin a file, overwriting *path*. *facts* are what is known of the camera, such as ``serial_number``.
+
+        Raises ``FormatError`` if *word* cannot be written here or the sensor does not fit, ``OSError`` from the disk.
+        """
         ...

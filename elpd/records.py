@@ -253,6 +253,16 @@ class ElpSample:
     travel_um: float = float("nan")
 
 
+class Cancel(IntEnum):
+    """Whether somebody wants a cycle to end, and where the lens is to be then."""
+
+    NO = 0
+    RETURN = 1
+    """At the place that the configuration declares."""
+    HOLD = 2
+    """Where it stops: somebody wants no motion at all."""
+
+
 class Direction(Enum):
     """Where focus lies, seen from the motion of the lens."""
 

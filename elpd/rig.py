@@ -16,7 +16,9 @@ from elpd.calibrate.aperture import with_profile
 from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.lens import teach
 from elpd.errors import ConfigError, DeviceError
+from elpd.focus.settings import CycleSettings
 from elpd.motion.lens_output import aperture_on_lens
+from elpd.motion.stepping import MOVE_DOF, SteppingLens
 from elpd.ports import Closeable, RigParts
 from elpd.scale import LensScale
 from elpd.timebase import MonotonicClock
@@ -75,6 +77,8 @@ def build(config: Config) -> RigParts:
     if config.rig == "sim":
         parts = _with_replacements(parts, config)
     teach(parts.lens, config)
+    if not parts.lens.capabilities.stop_on_command:
+        parts = replace(parts, lens=_in_moves(parts, config))
     return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
@@ -138,6 +142,13 @@ def _with_replacements(parts: RigParts, config: Config) -> RigParts:
     elif config.aperture.driver != "sim":
         parts = replace(parts, aperture=_open_aperture(config.aperture, parts.clock, parts.lens))
     return parts
+
+
+def _in_moves(parts: RigParts, config: Config) -> SteppingLens:
+    """Drive a lens that cannot be stopped in moves that need not be."""
+    settings = CycleSettings.from_config(config)
+    move_steps = MOVE_DOF * settings.depth_of_focus_um / parts.um_per_step
+    return SteppingLens(parts.lens, parts.clock, move_steps, settings.speed_um_s / parts.um_per_step)
 
 
 def _open(group: str, section: DeviceSection, clock: Clock) -> EventCamera:

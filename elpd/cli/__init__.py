@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import io
 import sys
+from pathlib import Path
 from typing import ClassVar, cast
 
 import click
@@ -21,6 +22,7 @@ from elpd.errors import ElpdError
 COMMANDS = {
     "calibrate": "measure the rig itself: aperture, backlash, lens, sensor",
     "check": "what is installed, what is plugged in, and does it work",
+    "convert": "an event file in another format, or a part of one",
     "decode": "what an event file holds",
     "demo": "focus the embedded simulated rig, live in the terminal",
     "detect": "the causal detector over a recorded sweep",
@@ -65,9 +67,15 @@ class LazyGroup(click.Group):
 @click.command(cls=LazyGroup, no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="elpd")
 @click.option("--verbose", "-v", is_flag=True, help="Log what happens, to stderr.")
-def root(*, verbose: bool) -> None:
+@click.option(
+    "--log",
+    "log_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Log to this file too, one JSON object a line.",
+)
+def root(*, verbose: bool, log_file: Path | None) -> None:
     """Real-time autofocus for event cameras."""
-    log.configure(verbose=verbose)
+    log.configure(verbose=verbose, file=log_file)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from elpd.errors import BusyError, UsageError
-from elpd.records import Roi
+from elpd.records import Geometry, Roi
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -82,6 +82,16 @@ def parse_roi(text: str | None) -> Roi | None:
     except ValueError:
         raise UsageError(f"--roi is X,Y,W,H in whole pixels, such as 100,80,200,200; got {text!r}") from None
     return Roi(x, y, width, height)
+
+
+def parse_geometry(text: str | None) -> Geometry | None:
+    """Read ``WxH``."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise UsageError(f"--geometry is WxH in whole pixels, such as 1280x720; got {text!r}")
+    return Geometry(int(width), int(height))
 
 
 def parse_interval_us(text: str | None, option: str) -> tuple[int, int] | None:

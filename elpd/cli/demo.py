@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from elpd.cli.session import Session
+    from elpd.record.session import Session
     from elpd.cli.view import View
     from elpd.records import ElpSample
 
@@ -102,10 +102,10 @@ class Demonstration:
 def run(config: Config, stream: TextIO | None) -> Demonstration:
     """Run one cycle on the simulated rig, shown on *stream* while it happens and once it is over.
 
-    Raises ``UsageError`` if a part of the rig is not simulated, and what ``elpd.cli.session.focus_on`` raises.
+    Raises ``UsageError`` if a part of the rig is not simulated, and what ``elpd.record.session.focus_on`` raises.
     """
     from elpd import rig  # noqa: PLC0415  (numba and the simulator only now)
-    from elpd.cli.session import focus_on  # noqa: PLC0415
+    from elpd.record.session import focus_on  # noqa: PLC0415
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
     from elpd.ports import Paced, Scenery  # noqa: PLC0415
     from elpd.records import Roi  # noqa: PLC0415

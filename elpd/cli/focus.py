@@ -41,7 +41,7 @@ def command(
         reference=_reference_path(reference, config),
         dry_run=dry_run,
     )
-    from elpd.cli.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
+    from elpd.record.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
     from elpd.cli.view import open_view  # noqa: PLC0415
 
     with interruptible() as cancelled:

@@ -192,7 +192,7 @@ def self_test(focus: Callable[[], dict[str, Any]]) -> Finding:
 
 def focus_simulated() -> dict[str, Any]:
     """Run one whole cycle on the default simulated rig, unrecorded."""
-    from elpd.cli.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
+    from elpd.record.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
     from elpd.config import Config  # noqa: PLC0415
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
 

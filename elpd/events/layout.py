@@ -23,6 +23,18 @@ _T_VIEWS = {"i8": "<i8", "u8": "<i8", "u4": "<u4"}
 _ADDRESS_VIEWS = {"u2": "<u2", "i2": "<u2"}
 
 
+EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
+"""Our own packing of an event: 13 bytes."""
+
+
+def packed(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> NDArray[Any]:
+    """Return four columns, which must be in range, as one structured array of ``EVENT``."""
+    events = np.empty(t.shape[0], EVENT)
+    for name, column in zip("txyp", (t, x, y, p), strict=True):
+        events[name] = column
+    return events
+
+
 def event_columns(events: NDArray[Any]) -> Columns:
     """Return t, x, y, p of a structured array, as views where its dtype allows.
 

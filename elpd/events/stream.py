@@ -117,8 +117,8 @@ class EventStream:
 
     Attributes
     ----------
-    encoding : Encoding or None
-        Of the packets; ``None`` before the first.
+    packet : CameraPacket or None
+        What the last chunk was made of; ``None`` before the first.
     """
 
     def __init__(self, reader: RecordingReader, geometry: Geometry | None = None) -> None:
@@ -126,12 +126,12 @@ class EventStream:
         self._geometry = geometry or reader.geometry
         self._decoder: WordDecoder | None = None
         self._outside = 0
-        self.encoding: Encoding | None = None
+        self.packet: CameraPacket | None = None
 
     def chunks(self, max_bytes: int = 1 << 20) -> Iterator[EventChunk]:
         """Yield the recording from its beginning; each chunk is valid until the next."""
         for packet in self._reader.packets(max_bytes):
-            self.encoding = packet.encoding
+            self.packet = packet
             if packet.encoding is Encoding.ARRAY:
                 t, x, y, p = event_columns(packet.data)
                 t, p = t.astype(np.int64, copy=False), np.asarray(p == 1, np.uint8)

@@ -26,6 +26,7 @@ from elpd.focus.watch import Watch, WatchSettings
 from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
     BiasSet,
+    Cancel,
     FocusEstimate,
     FocusResult,
     Outcome,
@@ -82,7 +83,8 @@ class FocusCycle:
     observer
         Somebody who watches; never waited for.
     cancelled
-        Asked once per turn of any loop, in every phase; true ends the cycle as CANCELLED.
+        Asked once per turn of any loop, in every phase; true ends the cycle as CANCELLED, and ``Cancel.HOLD`` leaves
+        the lens where it stopped, whatever place was declared.
 
     """
 
@@ -93,7 +95,7 @@ class FocusCycle:
         request: FocusRequest,
         sink: RunSink,
         observer: Observer | None = None,
-        cancelled: Callable[[], bool] = lambda: False,
+        cancelled: Callable[[], int] = lambda: False,
     ) -> None:
         self._parts = parts
         self._settings = settings
@@ -115,6 +117,16 @@ class FocusCycle:
         self._warnings: list[str] = []
         self.map: TemporalImage | None = None
         """The temporal map, once exposed, for whoever wants to store or show it."""
+
+    @property
+    def reference(self) -> Reference | None:
+        """The weights that the region is judged by; ``None`` if it was never chosen."""
+        return None if self._watch is None else self._watch.reference
+
+    @property
+    def passage(self) -> tuple[ElpSample, ...]:
+        """The windows of the last direction of travel, to its end."""
+        return () if self._watch is None else self._watch.passage
 
     def run(self) -> FocusResult:
         """Run the cycle to its one result.
@@ -348,7 +360,7 @@ class FocusCycle:
     def _interrupt(self) -> None:
         """End a phase that waits, if somebody asked for it or time is up."""
         ms_to_deadline = (self._deadline_ns - self._stage.now_ns()) / NS_PER_MS
-        verdict = safety.decide(safety.Conditions(cancelled=self._cancelled(), ms_to_deadline=ms_to_deadline))
+        verdict = safety.decide(safety.Conditions(cancelled=bool(self._cancelled()), ms_to_deadline=ms_to_deadline))
         if verdict.action is not safety.Action.CONTINUE:
             raise ended_by(verdict)
 
@@ -357,6 +369,8 @@ class FocusCycle:
         self._stage.listener = self._stage.interrupt = None
         self._parts.lens.stop(StopMode.RAMPED)
         self._stage.rest(REST_LIMIT_MS)
+        if self._cancelled() >= Cancel.HOLD:
+            return
         place = {"hold": None, "start": self._start_um, "preset": self._settings.preset_um}[self._settings.on_failure]
         if place is None or abs(self._stage.here_um() - place) < self._stage.um_per_step:
             return

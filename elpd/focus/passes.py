@@ -77,7 +77,7 @@ class Pass:
         if self.end_us > memory.track.times_us[-1]:
             memory.advance(self.end_us, self.sign * locate(self.end_us))
         deaf = memory.refractory()
-        ruler = lens_path(locate, self.begun_us, self.end_us)
+        ruler = lens_path(locate, self.begun_us, self.end_us, self.sign)
         said = memory.ask(memory.track.times_us[-1], ruler, brightness, deaf.period_us, dark=dark)
         if said is None:
             return Testimony(tuple(self.ask_frames(locate)))
@@ -171,7 +171,11 @@ def _jackknife(points: Sequence[tuple[int, float, NDArray[np.float64]]]) -> floa
     return float(np.sqrt((places.size - 1) * np.var(places)))
 
 
-def lens_path(locate: Callable[[SensorUs], float], begin_us: int, end_us: int) -> Ruler:
-    """Return the lens's path between two sensor times, finely sampled."""
+def lens_path(locate: Callable[[SensorUs], float], begin_us: int, end_us: int, sign: int) -> Ruler:
+    """Return the lens's path between two sensor times of a pass in the direction *sign*, finely sampled.
+
+    Where a model is put right by what was reported it may step back by as much as it is unsure; the lens did not.
+    """
     grid = np.arange(begin_us, end_us + 4 * PATH_STEP_US, PATH_STEP_US, dtype=np.float64)
-    return Ruler.of_path(grid, np.array([locate(SensorUs(int(when))) for when in grid]))
+    path = np.array([locate(SensorUs(int(when))) for when in grid])
+    return Ruler.of_path(grid, sign * np.maximum.accumulate(sign * path))

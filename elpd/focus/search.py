@@ -66,7 +66,7 @@ class Search:
         sink: RunSink,
         enter: EnterPhase,
         observe: Callable[[ElpSample, float], None],
-        cancelled: Callable[[], bool],
+        cancelled: Callable[[], int],
         interrupt: Callable[[], None],
     ) -> None:
         self._stage = stage

@@ -72,7 +72,7 @@ class Sweep:
         stage: Stage,
         watch: Watch,
         *,
-        cancelled: Callable[[], bool],
+        cancelled: Callable[[], int],
         observe: Callable[[ElpSample, float], None],
     ) -> None:
         self._stage = stage
@@ -123,7 +123,7 @@ class Sweep:
         limits = stage.parts.lens.limits
         edge_um = stage.to_um(limits.max_steps if plan.sign > 0 else limits.min_steps)
         return safety.Conditions(
-            cancelled=self._cancelled(),
+            cancelled=bool(self._cancelled()),
             ms_to_deadline=(plan.deadline_ns - now) / NS_PER_MS,
             camera_silent_ms=(now - heard_ns) / NS_PER_MS,
             travel_um=plan.sign * (here_um - begun_um),

@@ -187,6 +187,16 @@ class Watch:
         self._window_us = round(lamp.period_us * np.ceil(shortest_us / lamp.period_us))
 
     @property
+    def reference(self) -> Reference:
+        """The weights that the region is judged by: the first picture's, or the newest frame's."""
+        return self._reference
+
+    @property
+    def passage(self) -> tuple[ElpSample, ...]:
+        """The windows of this direction of travel so far."""
+        return tuple(self._samples)
+
+    @property
     def lit(self) -> bool:
         """Whether the sensor at rest has shown that the scene is in the light: a lamp flickers."""
         return self._lamp is not None

@@ -178,6 +178,8 @@ class Trajectory:
         self._history_ns = round(history_s * NS_PER_S)
         self._epochs: list[_Epoch] = []
         self._commands = 0
+        self.held_ns = 0
+        """How long the line is known to keep replies back, after they were sampled as promptly as ever."""
 
     @property
     def known(self) -> bool:
@@ -315,7 +317,7 @@ class Trajectory:
     def _sampled(self, report: LensReport) -> tuple[int, float]:
         """Return when the report was most likely sampled, and the standard deviation of that in seconds."""
         width = max(0, report.latest_ns - report.earliest_ns)
-        if width > self._timing.prompt_ns:
+        if width > self._timing.prompt_ns + self.held_ns:
             return report.earliest_ns + width // 2, width / math.sqrt(12) / NS_PER_S
         late = min(self._timing.reply_ns, width // 2)
         return report.earliest_ns + late, min(self._timing.reply_sigma_ns, width / math.sqrt(12)) / NS_PER_S

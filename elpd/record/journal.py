@@ -36,6 +36,9 @@ RUN_FORMAT = 1
 RUN_FILE = "run.json"
 DECISIONS_FILE = "decisions.jsonl"
 
+NOT_OF_A_RUN = ("journal", "service", "api", "modes", "temperature")
+"""Sections of the configuration that no cycle's decision depends on."""
+
 FLUSH_PHASES = frozenset({"choose", "done"})
 """Phases at whose beginning the lens stands still and nothing is about to move: time to write."""
 
@@ -96,7 +99,7 @@ class RunWriter:
         self._head: dict[str, Any] = {
             "format": RUN_FORMAT,
             "elpd": __version__,
-            "config": config.model_dump(mode="json", exclude={"journal"}),
+            "config": config.model_dump(mode="json", exclude=set(NOT_OF_A_RUN)),
             "request": asked,
             "attachments": {},
         }
@@ -117,7 +120,7 @@ class RunWriter:
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self.finish(None, error=error)
 
-    def watch(self, cancelled: Callable[[], bool]) -> Callable[[], bool]:
+    def watch(self, cancelled: Callable[[], int]) -> Callable[[], int]:
         """Put the answers of *cancelled* on the tape as well: the decision depends on them."""
         return self.tape.watch(cancelled)
 

@@ -70,7 +70,7 @@ class TapeReader:
         self._line_number = 0
         self._asked = 0
         self._polls = 0
-        self._cancelled = False
+        self._cancelled = 0
         self._next: dict[str, Any] | None = None
         self.end: dict[str, Any] | None = None
         self._divergence: ReplayDiverged | None = None
@@ -113,12 +113,12 @@ class TapeReader:
         answer: NDArray[np.float64] = self._answered(call, (digest(argument),))
         return answer
 
-    def cancelled(self) -> bool:
+    def cancelled(self) -> int:
         """Answer as the recorded ``cancelled`` did at the same poll."""
         self._polls += 1
         line = self._next
         if line is not None and line["call"] == "cancelled" and line["args"] == [self._polls]:
-            self._cancelled = bool(line["answer"])
+            self._cancelled = int(line["answer"])
             self._advance()
         return self._cancelled
 

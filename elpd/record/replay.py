@@ -74,7 +74,7 @@ def load_run(path: Path) -> RecordedRun:
 
 def replay_run(
     run: RecordedRun,
-    run_cycle: Callable[[RigParts, RecordedRun, RunSink, Callable[[], bool]], Mapping[str, Any]],
+    run_cycle: Callable[[RigParts, RecordedRun, RunSink, Callable[[], int]], Mapping[str, Any]],
 ) -> ReplayReport:
     """Run the cycle again.
 

@@ -144,14 +144,14 @@ class TapeWriter:
         self._keep(call, arguments, _Array(np.array(answer)))
         return answer
 
-    def watch(self, cancelled: Callable[[], bool]) -> Callable[[], bool]:
+    def watch(self, cancelled: Callable[[], int]) -> Callable[[], int]:
         """Wrap a question from outside the rig whose answer the decision depends on; its changes go on the tape."""
-        polls, last = 0, False
+        polls, last = 0, 0
 
-        def asked() -> bool:
+        def asked() -> int:
             nonlocal polls, last
             polls += 1
-            answer = bool(cancelled())
+            answer = cancelled()
             if answer != last:
                 last = answer
                 self._keep("cancelled", (polls,), answer)

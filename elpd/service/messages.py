@@ -271,10 +271,11 @@ class HomeAnswer(Result):
 
 
 class MoveAnswer(Result):
-    """``move``, ``jog``: at rest."""
+    """``move``, ``jog``: at rest, where it was sent or, *outcome* ``CANCELLED``, where it was stopped."""
 
     position_um: float
     sigma_um: float | None
+    outcome: Literal["OK", "CANCELLED"] = "OK"
 
 
 class Fault(Result):
@@ -308,6 +309,8 @@ class Preset(Result):
     name: str
     position_um: float
     roi: RoiBox | None = None
+    approach: Literal[-1, 0, 1] = 0
+    """From which side the lens came to it: towards smaller positions, unknown, towards larger ones."""
     saved_at: str
 
 

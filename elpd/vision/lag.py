@@ -6,13 +6,14 @@ pixels tell: their midpoints are put in classes of equal weight by slowness, a c
 a line through the classes has the lag for its slope. Whatever else makes one part of a picture differ from another
 (aberration, motion) shows in how the classes scatter about that line, so the error is taken from there and not from the
 thousands of pairs. A scene of one brightness tells nothing; then what is known of photoreceptors in general has the
-say: a lag is never negative, and longer ones are rarer, so the expectation before any measurement is an exponential.
+say: a lag is never negative, and which power of ten it has depends on the light, so the expectation before any
+measurement is log-normal.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import erfc, exp, inf, pi, sqrt
+from math import inf, log, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,10 +26,16 @@ if TYPE_CHECKING:
     from elpd.records import SensorProfile
 
 UNMEASURED_LAG_US = 1_000.0
-"""What a typical pixel's lag is expected to be when nothing tells: a tenth of it in sunlight, tenfold in the dark."""
+"""What a typical pixel's lag may as well exceed as not when nothing tells."""
+
+DECADES = 0.5
+"""One standard deviation of its logarithm to base ten: a tenth of the lag above in sunlight, tenfold in the dark."""
 
 OTHER_LIGHT = 0.5
 """How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
+
+_FAR, _CELLS = 6.0, 401
+"""How many standard deviations the distribution of a lag is drawn to, and how finely."""
 
 CLASSES = 10
 FEWEST_CLASSES = 5
@@ -113,26 +120,25 @@ def line_of_classes(
     return Line(slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24)), sqrt(variance), x.size)
 
 
-def expected_lag(line: Line | None, mean: float) -> Lag:
+def expected_lag(line: Line | None, median: float) -> Lag:
     """Return the mean and standard deviation of what is known after a measurement.
 
-    Before it, the lag has the exponential distribution of mean *mean*; a normal error on top leaves a normal
-    distribution cut off at zero.
+    Before it, the lag has the log-normal distribution of that *median* and of ``DECADES``; the measurement's error is
+    normal. The mean of an unmeasured lag is twice its median, its standard deviation three times.
     """
-    if mean <= 0.0:
+    if median <= 0.0:
         return Lag()
-    if line is None or line.sigma > 1e3 * mean:
-        return Lag(mean, mean)
-    sigma = line.sigma
-    shifted = line.slope - sigma * sigma / mean
-    cut = -shifted / sigma
-    # Mills' ratio; far out, where the normal's tail underflows, its own expansion.
-    hazard = (
-        cut + 1.0 / cut - 2.0 / cut**3 if cut > 20.0 else sqrt(2.0 / pi) * exp(-0.5 * cut * cut) / erfc(cut / sqrt(2.0))
-    )
-    at = shifted + sigma * hazard
-    variance = sigma * sigma * (1.0 + cut * hazard - hazard * hazard)
-    return Lag(max(at, 0.0), sqrt(variance) if variance > 0.0 else max(at, 0.0))
+    lag = median * np.exp(DECADES * log(10.0) * np.linspace(-_FAR, _FAR, _CELLS))
+    if line is not None:
+        near = line.slope + line.sigma * np.linspace(-_FAR, _FAR, _CELLS)
+        lag = np.union1d(lag, near[near > 0.0])
+    logarithm = -0.5 * np.square(np.log(lag / median) / (DECADES * log(10.0))) - np.log(lag)
+    if line is not None:
+        logarithm -= 0.5 * np.square((lag - line.slope) / line.sigma)
+    share = np.exp(logarithm - logarithm.max()) * np.gradient(lag)
+    share /= share.sum()
+    at = float(share @ lag)
+    return Lag(at, sqrt(float(share @ np.square(lag - at))))
 
 
 def weights_of_lines(lines: Sequence[Line | None]) -> NDArray[np.float64]:

@@ -68,9 +68,9 @@ class Ruler:
         return float(self.at(np.array([t_us], dtype=np.float64))[0])
 
     def stretch(self, t_us: float) -> tuple[float, float, float]:
-        """Return (begin_us, end_us, sign) of the monotone stretch of motion around *t_us*.
+        """Return (begin_us, end_us, sign) of the motion in one direction around *t_us*, first move to last.
 
-        The sign is that of the velocity, zero where the lens rests.
+        Rests on the way do not end it, only a reversal does. The sign is zero where the lens never moved before.
         """
         if self.endless:
             return -np.inf, np.inf, 1.0
@@ -79,13 +79,14 @@ class Ruler:
         # A rest belongs to the motion before it: events still answer to it.
         while signs[k] == 0 and k > 0:
             k -= 1
-        begin = k
-        while begin > 0 and signs[begin - 1] == signs[k]:
-            begin -= 1
-        end = k + 1
-        while end < signs.size and signs[end] == signs[k]:
-            end += 1
-        return float(self.times_us[begin]), float(self.times_us[end]), float(signs[k])
+        if signs[k] == 0:
+            return float(self.times_us[0]), float(self.times_us[1]), 0.0
+        against = np.flatnonzero(signs == -signs[k])
+        turns = np.searchsorted(against, k)
+        first = against[turns - 1] + 1 if turns > 0 else 0
+        last = against[turns] if turns < against.size else signs.size
+        moves = first + np.flatnonzero(signs[first:last])
+        return float(self.times_us[moves[0]]), float(self.times_us[moves[-1] + 1]), float(signs[k])
 
     def time_of(self, position: float, near_us: float) -> float:
         """Return when the lens was at *position*, in the stretch of motion around *near_us*."""

@@ -338,6 +338,27 @@ def test_an_alarm_in_motion_is_a_fault_from_which_homing_recovers(kind: str) -> 
     assert made.rotor == pytest.approx(1000, abs=2.1)
 
 
+@needs("remembers", "the controller reports no positions")
+def test_an_adapter_that_keeps_replies_back_makes_positions_vaguer_not_wrong(kind: str) -> None:
+    made = rig(kind)
+    made.port.faults.latency_timer_ns = 16_000_000
+    made.open(connect_ms=5000.0) if kind == "grbl" else made.open()
+    made.live(300)
+    made.lens.move_to(Steps(4567), SPEED_SPS)
+    off_sigmas = []
+    for _ in range(400):
+        made.live(1)
+        here = made.lens.position_at(made.clock.now_ns())
+        off_sigmas.append(abs(here.steps - made.rotor) / here.sigma_steps)
+    assert max(off_sigmas) < 3.0  # one motion is one draw: its errors all have one cause
+    assert made.rotor == pytest.approx(4567, abs=0.01)
+    assert not made.reports[-1].moving
+    assert "set the adapter's latency timer" in made.lens.remarks[0]
+    made.port.faults.latency_timer_ns = 0
+    made.live(1000)
+    assert made.lens.remarks == ()
+
+
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_stop_leaves_at_once_while_a_reply_is_due(kind: str) -> None:
     made = open_rig(kind)

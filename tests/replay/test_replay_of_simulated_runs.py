@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from elpd import rig
 from elpd.cli import detect as detect_command
 from elpd.cli import replay as replay_command
-from elpd.cli.session import focus_once
+from elpd.record.session import focus_once
 from elpd.config import Config
 from elpd.focus.cycle import FocusCycle
 from elpd.focus.settings import CycleSettings, FocusRequest

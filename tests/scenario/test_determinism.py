@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from elpd.cli.session import focus_once
 from elpd.config import load
 from elpd.focus.settings import FocusRequest
+from elpd.record.session import focus_once
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -9,15 +10,27 @@ import numpy as np
 import pytest
 from elpd_drivers.sim.scene import scene_canvas
 from scenarios import Event, SpyLens, Story, assert_invariants, play
+from scripted_rig import CAPABILITIES, Lens, scripted_rig
 
+from elpd.config import load
 from elpd.errors import UsageError
-from elpd.focus.settings import FocusRequest
+from elpd.focus.cycle import FocusCycle
+from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.records import CommandStamp, Outcome, Roi
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from elpd.units import HostNs
+
+
+class Unstoppable(Lens):
+    capabilities = replace(CAPABILITIES, stop_on_command=False)
+
+
+class SilentSink:
+    def note(self, event: str, /, **fields: object) -> None:
+        pass
 
 
 @pytest.fixture
@@ -47,14 +60,19 @@ def test_focused(board: str, start_um: float) -> None:
     assert_invariants(story)
 
 
-def test_a_lens_that_cannot_be_stopped_is_refused_before_anything_happens() -> None:
-    story = play("sim.board=theia", "sim.seed=3")
-    assert isinstance(story.error, UsageError)
-    assert "cannot be stopped while it moves" in str(story.error)
-    assert "nothing was moved" in str(story.error)
-    assert not story.moved
-    assert story.phases == []
-    assert story.camera_started_ns is None
+@pytest.mark.parametrize(("start_um", "speed_um_s"), [(-200.0, 4000.0), (200.0, 400.0)])
+def test_focused_by_a_lens_that_cannot_be_stopped(start_um: float, speed_um_s: float) -> None:
+    story = play("sim.board=theia", f"sim.start_um={start_um}", f"sim.speed_um_s={speed_um_s}", "sim.seed=11")
+    assert story.outcome is Outcome.FOCUSED
+    assert_invariants(story)
+    assert abs(story.errors["final_error_um"] or 0.0) < story.settings.depth_of_focus_um / 2
+
+
+def test_a_bare_lens_that_cannot_be_stopped_is_refused_before_anything_happens() -> None:
+    parts = scripted_rig([0, 0], lens=Unstoppable)  # two looks at the clock, and nothing else
+    cycle = FocusCycle(parts, CycleSettings.from_config(load()), FocusRequest(), SilentSink())
+    with pytest.raises(UsageError, match="nothing was moved"):
+        cycle.run()
 
 
 def test_focused_on_a_stored_picture(picture: Path) -> None:

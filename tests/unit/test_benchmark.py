@@ -275,7 +275,9 @@ def test_the_benchmark_runs_resumes_and_writes_one_self_contained_report(
     second = json.loads((out / "results.json").read_text())
     assert second["rows"][2:] == first["rows"]
     assert [(one["method"], one["rate"]) for one in second["rows"][:2]] == [("elpd", "50"), ("elpd", "-")]
-    assert all(abs(one["error_um"]) < 16.0 for one in second["rows"][:2])
+    with_frames, without = (one["error_um"] for one in second["rows"][:2])
+    assert abs(with_frames) < 16.0
+    assert without is None or abs(without) < 16.0  # events alone, in violent motion, may know that they do not know
 
     again = [*common, "--methods", "egs,pbf", "--resume", "--redo", "egs"]
     assert benchmark.main(again) == 0

@@ -135,7 +135,7 @@ def test_the_lag_of_dark_pixels_is_measured() -> None:
     line = line_of_classes(*pairs_of_a_lag(0.15))
     assert line is not None
     assert line.slope == pytest.approx(0.15, abs=3.0 * line.sigma)
-    lag = expected_lag(line, mean=1.0)
+    lag = expected_lag(line, median=1.0)
     assert lag.at == pytest.approx(line.slope, abs=0.01)
     assert lag.sigma == pytest.approx(line.sigma, rel=0.1)
 
@@ -144,9 +144,11 @@ def test_a_lag_is_never_negative_and_unmeasured_is_what_may_be_expected() -> Non
     line = line_of_classes(*pairs_of_a_lag(-0.1))
     assert line is not None
     assert line.slope < 0.0
-    assert 0.0 <= expected_lag(line, mean=1.0).at < line.sigma
-    assert expected_lag(None, mean=0.7) == Lag(0.7, 0.7)
-    assert expected_lag(None, mean=0.0) == Lag()
+    assert 0.0 <= expected_lag(line, median=1.0).at < line.sigma
+    unmeasured = expected_lag(None, median=0.7)
+    assert unmeasured.at == pytest.approx(0.7 * np.exp(0.5 * (0.5 * np.log(10.0)) ** 2), rel=1e-3)
+    assert unmeasured.sigma > 3.0 * 0.7, "a lag of five times the usual one is no surprise"
+    assert expected_lag(None, median=0.0) == Lag()
     middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
     assert line_of_classes(middle, weights, np.ones_like(slowness), mode, width) is None
     assert line_of_classes(middle[:20], weights[:20], slowness[:20], mode, width) is None

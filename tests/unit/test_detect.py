@@ -310,13 +310,14 @@ def test_the_published_method_can_be_chosen(folder: Any, monkeypatch: Any, capsy
     assert "needs a picture" in err
 
 
-def test_an_archive_without_frames_will_do(folder: Any, monkeypatch: Any, capsys: Any) -> None:
+def test_events_alone_do_not_tell_the_lag_of_a_fast_sweep(folder: Any, monkeypatch: Any, capsys: Any) -> None:
     path, focus_us = folder
     code, out, _ = run(monkeypatch, capsys, path / "events.npz", "--roi", "8,8,80,80", "--json")
-    assert code == 0
-    # This world's photoreceptors have no lag; without a picture one must be expected, and the error says so.
     found = json.loads(out)
-    assert abs(found["focus_us"] - focus_us) < found["sigma_us"] < 2_000
+    # A photoreceptor may be late by milliseconds, of 4 um each here; without a picture nothing says by how many.
+    assert (code, found["outcome"]) == (1, "LOW_CONFIDENCE")
+    assert abs(found["focus_us"] - focus_us) < found["sigma_us"]
+    assert found["sigma_us"] > 2_000
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,10 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import FormatError, UsageError
-from elpd.events.layout import columns, event_columns
+from elpd.events.layout import EVENT, event_columns
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
+from elpd_drivers.formats.columns import NAMES, pack
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
-MEMBERS = (("t", "timestamp", "ts"), ("x",), ("y",), ("p", "on", "polarity"))
 
 
 class NpyFormat:
@@ -46,7 +45,7 @@ class NpyFormat:
             return False
         try:
             with zipfile.ZipFile(path) as archive:
-                return any(f"{name}.npy" in archive.namelist() for name in MEMBERS[0])
+                return any(f"{name}.npy" in archive.namelist() for name in NAMES[0])
         except (zipfile.BadZipFile, OSError):
             return False
 
@@ -72,7 +71,10 @@ class NpyReader:
         self._path = path
         self._structured = self._events.dtype.fields is not None
         if self._structured and self._events.ndim == 1:
-            _checked(path, lambda events: event_columns(events[:0]), self._events)
+            try:
+                event_columns(self._events[:0])
+            except UsageError as error:
+                raise FormatError(f"{path}: {error}") from error
         elif not (self._events.ndim == 2 and self._events.shape[1] == 4 and self._events.dtype.kind in "iuf"):
             raise FormatError(
                 f"{path} holds {self._events.dtype} of shape {self._events.shape}; events are a structured array "
@@ -89,7 +91,7 @@ class NpyReader:
         for begin in range(0, len(events), step):
             piece = events[begin : begin + step]
             if not self._structured:
-                piece = _pack(self._path, *piece.T)
+                piece = pack(self._path, *piece.T)
             yield CameraPacket(np.asarray(piece), Encoding.ARRAY, HostNs(0))
 
     def close(self) -> None:
@@ -109,7 +111,7 @@ class NpzReader:
         except (zipfile.BadZipFile, OSError) as error:
             raise FormatError(f"{path} is a damaged archive: {error}") from error
         present = self._archive.namelist()
-        self._members = [next((f"{n}.npy" for n in names if f"{n}.npy" in present), None) for names in MEMBERS]
+        self._members = [next((f"{n}.npy" for n in names if f"{n}.npy" in present), None) for names in NAMES]
         if None in self._members:
             self._archive.close()
             raise FormatError(f"{path} holds {', '.join(present)}; events are four arrays t, x, y, p")
@@ -130,7 +132,7 @@ class NpzReader:
                 for begin in range(0, heads[0][0], step):
                     count = min(step, heads[0][0] - begin)
                     parts = [_read_exactly(self._path, f, d, count) for f, (_, d) in zip(files, heads, strict=True)]
-                    yield CameraPacket(_pack(self._path, *parts), Encoding.ARRAY, HostNs(0))
+                    yield CameraPacket(pack(self._path, *parts), Encoding.ARRAY, HostNs(0))
             except (zipfile.BadZipFile, EOFError, ValueError, OSError, NotImplementedError) as error:
                 raise FormatError(f"{self._path} is a damaged archive: {error}") from error
 
@@ -154,27 +156,3 @@ def _read_exactly(path: Path, file: IO[bytes], dtype: np.dtype[Any], count: int)
     if len(data) != count * dtype.itemsize:
         raise FormatError(f"{path} ends early: a column lacks {count - len(data) // dtype.itemsize} events or more")
     return np.frombuffer(data, dtype)
-
-
-def _pack(path: Path, t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> NDArray[Any]:
-    """Return columns of any number type as one structured array."""
-    whole = []
-    for name, column in (("t", t), ("x", x), ("y", y), ("p", p)):
-        if column.dtype.kind == "f":
-            rounded = np.rint(column)
-            # Not finite fails this too; 2^53 is where doubles stop being whole numbers one by one.
-            if not (np.abs(column) <= 2**53).all() or (rounded != column).any():
-                raise FormatError(f"{path}: {name} must be whole numbers (t in microseconds); it holds fractions")
-            column = rounded.astype(np.int64)
-        whole.append(column)
-    packed = np.empty(len(t), EVENT)
-    for name, column in zip("txyp", _checked(path, lambda parts: columns(*parts), whole), strict=True):
-        packed[name] = column
-    return packed
-
-
-def _checked(path: Path, look: Any, events: Any) -> Any:
-    try:
-        return look(events)
-    except UsageError as error:
-        raise FormatError(f"{path}: {error}") from error

@@ -20,15 +20,17 @@ from elpd.events.evt2 import swap_halves
 from elpd.events.registers import MAX_SIDE
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
+from elpd_drivers.formats import raw_write
+from elpd_drivers.formats.raw_write import write_raw
+from elpd_drivers.formats.text_header import read_header
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-MAX_HEADER_BYTES = 1 << 16
-MAX_LINE_BYTES = 1024
+__all__ = ["FORMAT", "RawFormat", "RawReader", "write_raw"]
 
 ENCODINGS = {
     "EVT3": Encoding.EVT3,
@@ -66,12 +68,25 @@ class RawFormat:
 
     def recognises(self, path: Path) -> bool:
         """Say whether the file begins with a header that names an EVT encoding."""
-        header, _ = _read_header(path)
+        header, _ = read_header(path)
         return "evt" in header or header.get("format", "").upper().startswith("EVT")
 
     def open(self, path: Path) -> RawReader:
         """Open for reading. Raises ``FormatError`` for an encoding that is not one of the three."""
         return RawReader(path)
+
+    @property
+    def writes(self) -> Mapping[str, str]:
+        """The encodings, all in ``.raw``."""
+        return dict.fromkeys(raw_write.WORDS, ".raw")
+
+    def can_write(self, word: str) -> None:
+        """Nothing beyond numpy is needed."""
+        del word
+
+    def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> raw_write.RawWriter:
+        """Begin a file. Raises ``FormatError`` for a sensor whose addresses do not fit 11 bits."""
+        return raw_write.RawWriter(path, word, geometry, facts)
 
 
 FORMAT = RawFormat()
@@ -82,12 +97,14 @@ class RawReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        header, self._offset = _read_header(path)
+        header, self._offset = read_header(path)
         self._warnings: list[str] = []
         self._notes: dict[str, Any] = {"header": header, "warnings": self._warnings, "lost": 0, "lost_reason": []}
         self.encoding, options = _encoding_of(path, header)
         self._notes["format"] = NAMES[self.encoding]
         self._geometry = _geometry_of(header, options, self._warnings)
+        if header.get("complete") == "no":
+            self._warnings.append("the recording was not finished: its disk was full, or its program was stopped")
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
@@ -144,63 +161,11 @@ class RawReader:
         return _time_steps(swap_halves(words)) > _time_steps(words)
 
 
-def write_raw(path: Path, geometry: Geometry, words: Iterable[NDArray[np.uint16]], header: Mapping[str, str]) -> int:
-    """Write EVT3 words to a RAW file that other software reads; return the number of bytes.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    geometry : Geometry
-        The sensor's size.
-    words : iterable of uint16 arrays
-        The payload, piece by piece.
-    header : mapping
-        Further lines, such as ``{"serial_number": "00050567"}``.
-    """
-    lines = {
-        **header,
-        "evt": "3.0",
-        "format": f"EVT3;height={geometry.height};width={geometry.width}",
-        "geometry": f"{geometry.width}x{geometry.height}",
-    }
-    text = "".join(f"% {key} {value}\n" for key, value in lines.items()) + "% end\n"
-    size = 0
-    with path.open("wb") as file:
-        size += file.write(text.encode())
-        for piece in words:
-            size += file.write(np.ascontiguousarray(piece, "<u2").tobytes())
-    return size
-
-
 def _time_steps(words: NDArray[np.uint64]) -> int:
     """Count the TIME_HIGH words that follow their predecessor closely, as they do where words are read aright."""
     highs = (words[words >> np.uint64(60) == 0x8] >> np.uint64(32)).astype(np.int64)
     steps = np.diff(highs)
     return int(((steps >= 0) & (steps < 1000)).sum())
-
-
-def _read_header(path: Path) -> tuple[dict[str, str], int]:
-    """Return the header's fields, and where the payload begins."""
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_HEADER_BYTES)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error.strerror}") from error
-    fields: dict[str, str] = {}
-    offset = 0
-    while text[offset : offset + 1] == b"%":
-        end = text.find(b"\n", offset, offset + MAX_LINE_BYTES)
-        line = text[offset + 1 : end].rstrip(b"\r")
-        # Without `% end`, a payload that begins with 0x25 looks like a line until its other bytes are seen.
-        if end < 0 or any(byte < 0x20 or byte == 0x7F for byte in line):
-            break
-        offset = end + 1
-        key, _, value = line.decode("utf-8", "replace").strip().partition(" ")
-        if key == "end":
-            break
-        fields[key.lower()] = value.strip()
-    return fields, offset
 
 
 def _encoding_of(path: Path, header: Mapping[str, str]) -> tuple[Encoding, dict[str, str]]:

@@ -285,6 +285,11 @@ class DirectLens:
         """What the controller can switch beside the motor."""
         return self._controller.outputs if isinstance(self._controller, Switching) else ()
 
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What a person should know of how the controller answers."""
+        return self._controller.asking.remarks
+
     def set_output(self, name: str, *, on: bool) -> CommandStamp:
         """Switch one of the controller's outputs."""
         controller = self._controller
@@ -348,6 +353,7 @@ class DirectLens:
         report = LensReport(reading.steps, HostNs(reading.earliest_ns), HostNs(latest), reading.velocity_sps, flags)
         if reading.restart and reading.earliest_ns < self._obeyed_ns:
             reading = replace(reading, restart=False)  # it was so before the last command
+        self._motor.replies_are_held(self._controller.asking.held_ns)
         if fuse:
             if reading.restart:
                 self._motor.begin(report)

@@ -183,6 +183,11 @@ class GrblLens:
         """What GRBL can switch beside the motor."""
         return tuple(OUTPUTS)
 
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What a person should know of how GRBL answers."""
+        return self._asking.remarks
+
     def set_output(self, name: str, *, on: bool) -> CommandStamp:
         """Switch an output. At rest only: in motion the line would wait behind the jog, or be refused."""
         check_output(name, self.outputs)
@@ -374,6 +379,7 @@ class GrblLens:
         number = self._unacknowledged.popleft()
         if number is None:
             return
+        earliest -= self._asking.held_ns
         width = max(latest - earliest, 0)
         sigma_ns = max(width / 12**0.5, 100 * NS_PER_US)
         self._motor.amend(number, latest - width // 2, sigma_ns, still_ending=not self._stopping)
@@ -413,6 +419,7 @@ class GrblLens:
             velocity,
             LensFlag.MOVING if moving else LensFlag.NONE,
         )
+        self._motor.replies_are_held(self._asking.held_ns)
         if fuse and not self._motor.believes(report):
             self._asking.soon()
             return None

@@ -114,6 +114,11 @@ class Motor:
 
     # --- what it reports -------------------------------------------------------------------------------------------
 
+    def replies_are_held(self, held_ns: int) -> None:
+        """Learn how long the line keeps replies back: so much of a report's interval says nothing of its sampling."""
+        with self._lock:
+            self._trajectory.held_ns = held_ns
+
     def begin(self, report: LensReport) -> None:
         """Forget what was modelled and begin from *report*."""
         with self._lock:

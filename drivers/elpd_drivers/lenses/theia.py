@@ -31,7 +31,7 @@ from elpd_drivers.lenses.motor import Motor
 from elpd_drivers.lenses.remembered import Remembered
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import PositionEstimate
@@ -108,6 +108,11 @@ class TheiaLens:
         self._at_switch = False
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What a person should know of how the controller answers."""
+        return self._asking.remarks
 
     @property
     def capabilities(self) -> LensCapabilities:

@@ -313,6 +313,7 @@ class TmclController:
             self.asking.answered()
             return
         self._waiting = question = self._round.popleft()
+        self.asking.asked(self._clock.now_ns())
         motor = wire.USER_BANK if question.command in {wire.GGP, wire.SGP} else None
         sent = self._line.send(self._talk.frame(question.command, question.kind, motor=motor))
         self._asked_off_ns = sent.off_wire_ns

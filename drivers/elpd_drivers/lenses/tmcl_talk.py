@@ -46,7 +46,7 @@ class TmclSettings:
     home_um_s: float = 1000.0
     switch_um_s: float = 125.0
     query_ms: float = 5.0
-    reply_ms: float = 60.0
+    reply_ms: float = 100.0
     latency_us: float = 250.0
     latency_sigma_us: float = 100.0
 

@@ -330,6 +330,8 @@ class ZaberController:
             elif reply.number in self._orders:
                 self._orders.discard(reply.number)
                 self._refuse_rejection(reply)
+            else:
+                self.asking.late()
         return reading
 
     def _position(self, reply: wire.Reply, latest_ns: int) -> Reading | None:

@@ -19,8 +19,9 @@ import numpy as np
 from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
-from elpd.records import Encoding, Geometry, Roi
+from elpd.records import Encoding, Geometry, LensReport, Roi
 from elpd.scale import LensScale
+from elpd.units import Steps, after_ms
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, Wire
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 MARGIN_PX = 32
 INTERPOLATION_PX = 3
 ROOM_UM = 300.0
+HOMING_MS = 60_000.0
 CAMERAS = {"evk4": Geometry(1280, 720), "davis346": Geometry(346, 260)}
 MASK_SLOTS = {"evk4": 64, "davis346": 8}
 OBJECT_SCENE = "gravel"
@@ -365,7 +367,22 @@ def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[
     wanted = Wanted(chosen.um_per_step, chosen.travel_um, 3 * chosen.speed_um_s, chosen.acceleration_um_s2)
     port, table = fitted(chosen.board, mechanism, wanted, world, seed=chosen.seed)
     world.add(port)
-    return controller(chosen.board).open_lens(table, world, port), port
+    lens = controller(chosen.board).open_lens(table, world, port)
+    if not lens.capabilities.stop_on_command:  # nor does such a controller remember where it is: as a person would
+        here = Steps(round(mechanism.rotor_at(world.now_ns())))
+        lens.home(after_ms(world.now_ns(), HOMING_MS))
+        lens.move_to(here, lens.limits.max_speed_sps)
+        _at_rest(lens, world)
+    return lens, port
+
+
+def _at_rest(lens: Lens, world: World) -> LensReport:
+    """Return the first report of rest."""
+    while True:
+        report = lens.poll()
+        if report is not None and not report.moving:
+            return report
+        world.sleep_until(after_ms(world.now_ns(), 1.0))
 
 
 def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:

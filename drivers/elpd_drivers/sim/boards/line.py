@@ -51,12 +51,19 @@ class WireFaults:
     """What can be wrong with a cable; change a field at any time.
 
     ``garble`` rewrites what the host receives (bytes in, bytes out); ``disconnect_at_ns`` pulls the plug.
+    ``latency_timer_ns`` makes the adapter an FTDI: it keeps what it received until its timer runs out (16 ms unless
+    somebody set it), or until ``ADAPTER_PACKET`` bytes have come.
     """
 
     drop_to_board: bool = False
     drop_to_host: bool = False
     garble: Callable[[bytes], bytes] | None = None
     disconnect_at_ns: int | None = None
+    latency_timer_ns: int = 0
+
+
+ADAPTER_PACKET = 62
+"""The payload of an FTDI's full-speed packet: 64 bytes less two of modem status (FTDI AN232B-04)."""
 
 
 class Wire:
@@ -77,6 +84,8 @@ class Wire:
         self._to_board: deque[tuple[int, int]] = deque()
         self._to_host: deque[tuple[int, int]] = deque()
         self._out_free_ns = self._in_free_ns = 0
+        self._kept: list[int] = []
+        self._kept_until_ns = 0
 
     def send(self, data: bytes, at_ns: int) -> None:
         """Let the host write at *at_ns*; the bytes follow those already in flight."""
@@ -107,8 +116,26 @@ class Wire:
         """Return (and forget) what the host has received by *when_ns*."""
         received = bytearray()
         while self._to_host and self._to_host[0][0] <= when_ns:
-            received.append(self._to_host.popleft()[1])
-        return bytes(received)
+            at_ns, byte = self._to_host.popleft()
+            received += self._passed_on(at_ns)
+            self._keep(byte, at_ns)
+            if len(self._kept) >= ADAPTER_PACKET:
+                received += self._passed_on(self._kept_until_ns)
+        return bytes(received + self._passed_on(when_ns))
+
+    def _keep(self, byte: int, at_ns: int) -> None:
+        """Let the adapter have a byte; its timer runs on a grid of its own."""
+        if not self._kept:
+            timer_ns = self.faults.latency_timer_ns
+            self._kept_until_ns = at_ns if timer_ns == 0 else (at_ns // timer_ns + 1) * timer_ns
+        self._kept.append(byte)
+
+    def _passed_on(self, when_ns: int) -> bytes:
+        """Return (and forget) what the adapter hands to the host by *when_ns*."""
+        if when_ns < self._kept_until_ns:
+            return b""
+        passed, self._kept = bytes(self._kept), []
+        return passed
 
     def disconnected(self, when_ns: int) -> bool:
         """Say whether the plug is out."""

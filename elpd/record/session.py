@@ -1,4 +1,4 @@
-"""One cycle from the command line: build the rig, record the run, focus, tell the truth where a simulator knows it."""
+"""One cycle, whoever asks for it: record the run, focus, tell the truth where a simulator knows it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
     from elpd.config import Config
     from elpd.ports import RigParts
-    from elpd.records import FocusResult, TemporalImage
+    from elpd.records import ElpSample, FocusResult, TemporalImage
+    from elpd.vision.reference import Reference
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,10 @@ class Session:
     truth: dict[str, float | None] | None
     run: Path | None
     map: TemporalImage | None
+    reference: Reference | None = None
+    """The weights that the cycle ended with."""
+    passage: tuple[ElpSample, ...] = ()
+    """The windows of the last direction of travel."""
 
     @property
     def focused(self) -> bool:
@@ -53,7 +58,7 @@ def focus_once(
     config: Config,
     request: FocusRequest,
     observer: Observer | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
+    cancelled: Callable[[], int] = lambda: False,
 ) -> Session:
     """Run one whole cycle on the rig that *config* describes, and give the rig back.
 
@@ -71,7 +76,7 @@ def focus_on(
     config: Config,
     request: FocusRequest,
     observer: Observer | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
+    cancelled: Callable[[], int] = lambda: False,
 ) -> Session:
     """Run one whole cycle on a rig that stays the caller's; raises what ``focus_once`` raises."""
     config = as_measured(config)  # what is recorded with the run is what was in force
@@ -88,4 +93,4 @@ def focus_on(
         truth = None if parts.truth is None else parts.truth.errors(result)
         run.finish(result_fields(result), truth=truth)
     structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
-    return Session(result, truth, run.path, cycle.map)
+    return Session(result, truth, run.path, cycle.map, cycle.reference, cycle.passage)

@@ -1,0 +1,351 @@
+"""Live cameras as ``EventCamera``: the same for every library, which runs in a process of its own.
+
+The controller never waits for a camera library. It waits on the ring's descriptor, on the child's line and on nothing
+else; a packet is a view of where the child put it. When the child dies, hangs or says that the camera is gone, ``read``
+raises ``CameraError`` then and there, and goes on raising until ``start`` or ``reopen`` has brought a new child up.
+Whether and when to try again is the caller's business; that trying often does not hammer the bus is ours: the pauses
+between attempts grow from 0.1 to 5 s.
+
+A reader who was busy finds packets waiting. One that waited longer than ``max_delay_ms`` is of no use to a loop that
+must stop a lens: then everything but the newest is thrown away, counted, and the next packet says so.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from elpd.errors import CameraError, ConfigError, UsageError
+from elpd.records import CameraPacket
+from elpd.units import NS_PER_MS, NS_PER_S, HostNs, SensorUs
+from elpd_drivers.cameras.process import CaptureProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from elpd.ports import Clock
+    from elpd.records import BiasSet, Frame, Geometry, Roi, Trigger
+    from elpd_drivers.cameras.ring import Taken
+    from elpd_drivers.cameras.source import CaptureSettings, SourceFacts
+
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
+LATE_CLOCK_NS = NS_PER_S
+LOOK_MS = 10.0
+"""How long to wait at most before looking whether the child still turns."""
+
+MOST_EDGES = 4096
+
+
+def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSettings, clock: Clock) -> CapturedCamera:
+    """Open a live camera in a process of its own.
+
+    Parameters
+    ----------
+    backend
+        ``module:function`` that makes the ``Source``, in the child.
+    settings
+        What the child makes it with: plain data.
+    common
+        The keys that every live camera has.
+    clock
+        Of the rig; it must be the host's monotonic clock, which the packets are stamped with.
+
+    Raises
+    ------
+    CameraError
+        If the camera cannot be opened.
+    ConfigError
+        For a rig that lives in another time.
+    """
+    if abs(clock.now_ns() - time.monotonic_ns()) > LATE_CLOCK_NS:
+        raise ConfigError(
+            'camera: a live camera lives in real time, this rig does not; set rig = "hardware", or play a recording '
+            'with camera.driver = "file"'
+        )
+    process = _begin(backend, settings, common)
+    try:
+        facts = process.wait_ready()
+    except CameraError:
+        process.kill()
+        raise
+    kind = type("CapturedCamera", tuple(ABILITIES[name] for name in facts.abilities) or (CapturedCamera,), {})
+    camera: CapturedCamera = kind(process, facts, lambda: _begin(backend, settings, common), common.max_delay_ms)
+    return camera
+
+
+def _begin(backend: str, settings: Mapping[str, Any], common: CaptureSettings) -> CaptureProcess:
+    return CaptureProcess(backend, settings, ring_mb=common.ring_mb, open_timeout_s=common.open_timeout_s)
+
+
+class CapturedCamera:
+    """An ``EventCamera`` with ``Latency``, ``Identified``, ``Counters``, ``Reopens`` and ``Closeable``.
+
+    What only some cameras can do is mixed in by ``open_captured``, from ``ABILITIES``.
+    """
+
+    def __init__(self, process: CaptureProcess, facts: SourceFacts, begin: Any, max_delay_ms: float) -> None:
+        self._process: CaptureProcess | None = process
+        self._facts, self._dtype = facts, facts.dtype()
+        self._begin = begin
+        self._max_delay_ns = max_delay_ms * NS_PER_MS
+        self._delivering = False
+        self._generation = 0
+        self._fault = ""
+        self._pause_s, self._next_try_s = FIRST_PAUSE_S, 0.0
+        self._gap, self._lost = False, 0
+        self._frames: tuple[Frame, ...] = ()
+        self._edges: tuple[Trigger, ...] = ()
+        self._shedding = self._proven = False
+        self._counts: dict[str, float] = dict.fromkeys(
+            ("packets", "bytes", "events", "lost_events", "gaps", "late_packets_dropped", "most_waiting", "reopened"), 0
+        )
+        self._notes: dict[str, float] = {}
+
+    @property
+    def geometry(self) -> Geometry:
+        """The sensor's size."""
+        return self._facts.geometry
+
+    @property
+    def min_latency_us(self) -> float:
+        """The shortest delay between an event and the host's receipt of its packet."""
+        return self._facts.min_latency_us
+
+    @property
+    def serial(self) -> str:
+        """The serial number."""
+        return self._facts.serial
+
+    @property
+    def model(self) -> str:
+        """The maker's name for it."""
+        return self._facts.model
+
+    @property
+    def counters(self) -> Mapping[str, float]:
+        """What was delivered and what was lost, where; the camera library's own counters among them. Never waits."""
+        if self._process is not None:
+            self._notes = self._process.notes()
+        return {**self._counts, **self._notes}
+
+    def start(self) -> None:
+        """Begin to deliver from now on; a lost camera is opened again first. Raises ``CameraError``."""
+        if self._delivering:
+            return
+        process = self._process
+        if process is None:
+            process = self._open_again()
+        try:
+            self._await_ready(process)
+            self._generation += 1
+            process.call("deliver", [self._generation])
+        except CameraError as error:
+            self._lose(error)
+            raise
+        self._delivering = True
+        self._gap, self._lost, self._frames, self._edges = False, 0, (), ()
+
+    def stop(self) -> None:
+        """Stop delivering; the camera stays open. Idempotent."""
+        if not self._delivering:
+            return
+        self._delivering = False
+        if self._process is not None:
+            try:
+                self._process.call("deliver", [0])
+            except CameraError as error:
+                self._lose(error)
+
+    def close(self) -> None:
+        """Give the camera back; ``start`` would open it again. Idempotent."""
+        self._delivering = False
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+            self._fault = "camera: it was closed; call start() to open it again"
+
+    def reopen(self) -> bool:
+        """Take one step towards being open again, never waiting; say whether it is.
+
+        Raises ``CameraError`` with the reason when an attempt failed; until the next one is due it just says no.
+        """
+        process = self._process
+        if process is None:
+            if time.monotonic() < self._next_try_s:
+                return False
+            process = self._open_again()
+        try:
+            process.wait(0)
+            process.check()
+            if process.facts is not None:
+                self._came_back(process.facts)
+        except CameraError as error:
+            self._lose(error)
+            raise
+        return process.facts is not None
+
+    def read(self, timeout_s: float) -> CameraPacket | None:
+        """Wait up to *timeout_s* for a packet; see ``EventCamera.read``."""
+        process = self._process
+        if process is None or not self._delivering:
+            raise CameraError(self._fault or "camera: read before start; call start() first")
+        until_ns = time.monotonic_ns() + round(timeout_s * NS_PER_S)
+        try:
+            while True:
+                taken = process.reader.take()
+                if taken is not None:
+                    packet = self._sift(taken)
+                    if packet is not None:
+                        return packet
+                    continue
+                left_ms = (until_ns - time.monotonic_ns()) / NS_PER_MS
+                if left_ms <= 0:
+                    process.wait(0)
+                    process.check()
+                    return None
+                process.wait(min(left_ms, LOOK_MS))
+                process.check()
+        except CameraError as error:
+            self._lose(error)
+            raise
+
+    # --- below: how it is done -------------------------------------------------------------------------------------
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Use an ability of the camera. Raises ``UsageError`` if it cannot, ``CameraError`` if it is lost."""
+        if self._process is None:
+            raise CameraError(self._fault)
+        try:
+            return self._process.call(name, arguments)
+        except CameraError as error:
+            self._lose(error)
+            raise
+
+    def _sift(self, taken: Taken) -> CameraPacket | None:
+        """Turn what came out of the ring into a packet, unless it is of an earlier delivery or too late."""
+        process, counts = self._process, self._counts
+        if taken.generation != self._generation or process is None:
+            return None
+        waiting = process.reader.waiting
+        counts["most_waiting"] = max(counts["most_waiting"], waiting)
+        self._gap = self._gap or taken.gap_before
+        self._lost += taken.lost_events
+        self._frames += taken.frames
+        self._edges += taken.triggers
+        if self._is_stale(taken, waiting):
+            counts["late_packets_dropped"] += 1
+            self._gap, self._lost = True, self._lost + taken.events
+            self._frames, self._edges = self._frames[-1:], self._edges[-MOST_EDGES:]
+            return None
+        packet = CameraPacket(
+            data=np.frombuffer(taken.data, self._dtype),
+            encoding=self._facts.encoding,
+            received_ns=HostNs(taken.received_ns),
+            complete_until_us=None if taken.complete_until_us is None else SensorUs(taken.complete_until_us),
+            frames=self._frames,
+            triggers=self._edges,
+            gap_before=self._gap,
+            lost_events=self._lost,
+            backlog=waiting + taken.backlog,
+        )
+        if not self._proven:  # one that opens and then says nothing has not come back
+            self._proven, self._pause_s, self._next_try_s = True, FIRST_PAUSE_S, 0.0
+        counts["packets"] += 1
+        counts["bytes"] += len(taken.data)
+        counts["events"] += taken.events
+        counts["lost_events"] += self._lost
+        counts["gaps"] += self._gap
+        self._gap, self._lost, self._frames, self._edges = False, 0, (), ()
+        return packet
+
+    def _is_stale(self, taken: Taken, waiting: int) -> bool:
+        """Say whether to throw this packet away: from the first that is too late until none waits behind."""
+        late = self._max_delay_ns > 0 and time.monotonic_ns() - taken.received_ns > self._max_delay_ns
+        self._shedding = (late or self._shedding) and waiting > 0
+        return self._shedding
+
+    def _open_again(self) -> CaptureProcess:
+        now_s = time.monotonic()
+        if now_s < self._next_try_s:
+            raise CameraError(f"{self._fault} (next attempt in {self._next_try_s - now_s:.1f} s)")
+        self._next_try_s = now_s + self._pause_s
+        self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+        process: CaptureProcess = self._begin()
+        self._process = process
+        return process
+
+    def _await_ready(self, process: CaptureProcess) -> None:
+        if process.facts is None:
+            self._came_back(process.wait_ready())
+
+    def _came_back(self, facts: SourceFacts) -> None:
+        """Take a camera that was opened again, if it is the one it was."""
+        if facts.serial != self._facts.serial or facts.geometry != self._facts.geometry:
+            raise CameraError(
+                f"camera: another one is plugged in ({facts.model} {facts.serial}, it was {self._facts.model} "
+                f"{self._facts.serial}); plug that one in, or start elpd again"
+            )
+        if self._fault:
+            self._counts["reopened"] += 1
+        self._fault, self._proven = "", False
+
+    def _lose(self, error: CameraError) -> None:
+        self._fault = str(error)
+        self._delivering = False
+        if self._process is not None:
+            self._process.kill()
+            self._notes = self._process.notes()
+            self._process = None
+
+
+class _Window(CapturedCamera):
+    def set_window(self, window: Roi | None) -> None:
+        """Deliver only *window*, or everything again with ``None``. Raises ``UsageError`` if it does not fit."""
+        if window is not None and not window.fits(self.geometry):
+            raise UsageError(
+                f"camera: window {window.x},{window.y},{window.width},{window.height} does not fit the sensor of "
+                f"{self.geometry.width}x{self.geometry.height}; choose one inside it"
+            )
+        self.call("set_window", None if window is None else [window.x, window.y, window.width, window.height])
+
+
+class _Biases(CapturedCamera):
+    def apply_biases(self, biases: BiasSet) -> None:
+        """Switch to a set of biases; a few milliseconds of disorder follow."""
+        self.call("apply_biases", biases.value)
+
+
+class _Mask(CapturedCamera):
+    def set_mask(self, pixels: Sequence[tuple[int, int]]) -> int:
+        """Switch off the first of *pixels*, as many as there are slots; return how many."""
+        return int(self.call("set_mask", [[int(x), int(y)] for x, y in pixels]))
+
+
+class _TriggerInput(CapturedCamera):
+    def enable_trigger(self, *, on: bool) -> None:
+        """Listen to the trigger input, or do not."""
+        self.call("enable_trigger", on)
+
+
+class _RateLimit(CapturedCamera):
+    def limit_rate(self, mev_s: float | None) -> None:
+        """Let the sensor send that many million events a second at most, or all with ``None``."""
+        self.call("limit_rate", mev_s)
+
+
+class _Temperature(CapturedCamera):
+    def temperature_c(self) -> float:
+        """Return the sensor's temperature."""
+        return float(self.call("temperature_c"))
+
+
+ABILITIES: dict[str, type[CapturedCamera]] = {
+    "window": _Window,
+    "biases": _Biases,
+    "mask": _Mask,
+    "trigger": _TriggerInput,
+    "rate_limit": _RateLimit,
+    "temperature": _Temperature,
+}

@@ -1,0 +1,5 @@
+"""``python -m elpd`` is ``elpd``."""
+
+from elpd.cli import main
+
+main()

@@ -1,0 +1,165 @@
+"""Between requests: where the lens is, whether the camera lives, and what it sees.
+
+A lens at rest is asked where it is all the same, for a cable that was pulled should be known of before somebody asks
+for focus, and some boards switch their motor off when nobody asks. The camera is listened to all the time, or for a
+moment now and then where listening costs (``service.look_every_s``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from elpd.errors import CameraError, LensError
+from elpd.events.stream import PacketDecoder
+from elpd.records import LensFlag
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from elpd.config import ServiceSection
+    from elpd.events.decoder import EventArrays
+    from elpd.ports import RigParts
+    from elpd.records import CameraPacket, LensReport
+    from elpd.service.situation import Situation
+    from elpd.service.timing import Time
+
+READ_TIMEOUT_S = 0.01
+"""One turn of listening; a request waits no longer than this for its turn."""
+
+SILENCE_S = 1.0
+"""While nothing moves a camera may say nothing for so long before it counts as lost."""
+
+FRAMES_WITHIN_S = 0.5
+"""A camera that has delivered no frame in so much listening has none."""
+
+
+class Idle:
+    """What the focus thread does between requests.
+
+    Parameters
+    ----------
+    situation, time
+        What is told, and by which time.
+    settings
+        How often to look.
+    hear
+        Takes every packet with its events (views); for pictures and evidence.
+    """
+
+    def __init__(
+        self,
+        situation: Situation,
+        time: Time,
+        settings: ServiceSection,
+        hear: Callable[[CameraPacket, EventArrays], None],
+    ) -> None:
+        self._situation = situation
+        self._time = time
+        self._settings = settings
+        self._hear = hear
+        self._decoder: PacketDecoder | None = None
+        self._look_begun_s: float | None = None
+        self._look_ended_s = float("-inf")
+        self._last_packet_s = 0.0
+        self._events = 0
+        self._listened_s = 0.0
+        self._polled_s = float("-inf")
+        self.every_s = 0.0
+        """How often to listen; 0 is all the time."""
+
+    def reconfigure(self, settings: ServiceSection) -> None:
+        """Take other settings."""
+        self._settings = settings
+
+    @property
+    def looking(self) -> bool:
+        """Whether the camera delivers."""
+        return self._look_begun_s is not None
+
+    def opened(self, parts: RigParts) -> None:
+        """Begin with a rig that was just opened."""
+        geometry = parts.camera.geometry
+        self._decoder = PacketDecoder(geometry)
+        self._look_begun_s, self._look_ended_s, self._polled_s = None, float("-inf"), float("-inf")
+        limits = parts.lens.limits
+        self._situation.update_camera(width=geometry.width, height=geometry.height, connected=True)
+        self._situation.update_lens(
+            connected=True, limits_um=(parts.scale.to_um(limits.min_steps), parts.scale.to_um(limits.max_steps))
+        )
+
+    def turn(self, parts: RigParts, *, needs_home: bool) -> None:
+        """Do one turn: a few milliseconds of listening or napping, the lens asked once.
+
+        Raises ``CameraError`` or ``LensError`` when one of them is lost.
+        """
+        now_s = self._time.now_s()
+        if now_s - self._polled_s >= 1e-3 * self._settings.poll_ms:
+            self._polled_s = now_s
+            self.tell_lens(parts, parts.lens.poll(), needs_home=needs_home)
+        if self._look_begun_s is None and now_s - self._look_ended_s >= self.every_s:
+            self._begin_look(parts, now_s)
+        if self._look_begun_s is None:
+            left_s = self._look_ended_s + self.every_s - now_s
+            self._time.nap(max(1e-4, min(1e-3 * self._settings.poll_ms, left_s)))
+            return
+        self._read(parts)
+        if self._time.now_s() - self._look_begun_s >= self._settings.look_s:
+            self._end_look(parts)
+
+    def leave(self, parts: RigParts) -> None:
+        """Stop listening: a cycle needs the camera for itself."""
+        if self._look_begun_s is not None:
+            self._look_begun_s = None
+            parts.camera.stop()
+        self._look_ended_s = self._time.now_s()
+
+    def tell_lens(self, parts: RigParts, report: LensReport | None, *, needs_home: bool) -> None:
+        """Tell where the lens is; what no report says stays as it was."""
+        if report is not None:
+            referenced = LensFlag.REFERENCED in report.flags and not needs_home
+            self._situation.update_lens(moving=report.moving, referenced=referenced)
+        try:
+            here = parts.lens.position_at(parts.clock.now_ns())
+        except LensError:
+            self._situation.update_lens(position_um=None, sigma_um=None)
+            return
+        per_step_um = abs(parts.scale.to_um(here.steps + 1) - parts.scale.to_um(here.steps))
+        self._situation.update_lens(position_um=parts.scale.to_um(here.steps), sigma_um=here.sigma_steps * per_step_um)
+
+    def _begin_look(self, parts: RigParts, now_s: float) -> None:
+        parts.camera.start()
+        self._decoder = PacketDecoder(parts.camera.geometry)
+        self._look_begun_s = self._last_packet_s = now_s
+        self._events = 0
+
+    def _end_look(self, parts: RigParts) -> None:
+        now_s, begun_s = self._time.now_s(), self._look_begun_s
+        assert begun_s is not None, "a look ends after it began"
+        self._listened_s += now_s - begun_s
+        rate = self._events / max(1e-6, now_s - begun_s)
+        known = {} if self._situation.camera.has_frames or self._listened_s < FRAMES_WITHIN_S else {"has_frames": False}
+        self._situation.update_camera(events_per_s=rate, **known)
+        if self.every_s > 0:
+            self.leave(parts)
+        else:
+            self._look_begun_s, self._events = now_s, 0
+
+    def _read(self, parts: RigParts) -> None:
+        packet = parts.camera.read(READ_TIMEOUT_S)
+        now_s = self._time.now_s()
+        if packet is None:
+            silent_s = now_s - self._last_packet_s
+            if silent_s > SILENCE_S:
+                raise CameraError(
+                    f"camera: no data for {silent_s:.1f} s (limit {SILENCE_S:g}) while nothing moved; check its cable "
+                    "and power, then clear the fault"
+                )
+            return
+        self._last_packet_s = now_s
+        assert self._decoder is not None, "a look begins with a decoder"
+        events = self._decoder.feed(packet)
+        self._events += events.t.size
+        self._situation.heard(int(events.t.size), packet.lost_events)
+        frames = {"has_frames": True} if packet.frames else {}
+        self._situation.update_camera(backlog=packet.backlog, **frames)
+        self._hear(packet, events)

@@ -1,0 +1,164 @@
+"""``elpd convert``: everything that a file holds in another format, or told what was left behind."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from command_line import Answer, caller
+from elpd_drivers.formats.raw import FORMAT as RAW
+from event_files import GEOMETRY, edge, many, packet, peak_bytes, read_all
+
+from elpd.errors import UsageError
+from elpd.record.convert import Slice, convert
+from elpd.record.files import appearing_whole
+from elpd.records import CameraPacket, Encoding, Geometry, Roi
+from elpd.units import HostNs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+FIELDS = {
+    *("out", "format", "width", "height", "events", "on", "first_us", "last_us", "triggers", "frames", "shift_us"),
+    *("lost", "lost_reason", "warnings"),
+}
+EDGES = [edge(9000, 1), edge(12_000, 1, rising=False)]
+COLUMNS = [column.tolist() for column in many(1000)]
+
+
+@pytest.fixture
+def elpd(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Answer]:
+    return caller(capsys, monkeypatch, tmp_path)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "in.raw"
+    with closing(RAW.create(path, "evt3", GEOMETRY, {"serial_number": "7"})) as writer:
+        writer.write(packet(COLUMNS, triggers=EDGES))
+    return path
+
+
+def test_the_answer_says_what_was_written(elpd: Callable[..., Answer], recording: Path, tmp_path: Path) -> None:
+    answer = elpd("convert", str(recording), "out.raw", "--format", "evt2", "--json")
+    assert (answer.code, answer.err) == (0, "")
+    assert answer.json.keys() >= FIELDS
+    assert [answer.json[name] for name in ("format", "width", "height", "events", "triggers", "lost")] == [
+        *("evt2", 64, 48, 1000, 2, 0)
+    ]
+    assert (answer.json["first_us"], answer.json["last_us"]) == (COLUMNS[0][0], COLUMNS[0][-1])
+    assert read_all(tmp_path / "out.raw") == (COLUMNS, EDGES, [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.raw", "out.raw"]
+    told = elpd("convert", str(recording), "out.raw", "--force")
+    assert "out.raw: evt3, 64x48, 1,000 events" in told.out
+
+
+def test_a_part_keeps_its_times_and_addresses(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.raw"
+    convert(recording, out, part=Slice(Roi(10, 5, 20, 30), 8000, 12_000))
+    t, x, y, p = map(np.array, COLUMNS)
+    keep = (t >= 8000) & (t < 12_000) & (x >= 10) & (x < 30) & (y >= 5) & (y < 35)
+    assert 0 < keep.sum() < 1000
+    assert read_all(out) == ([column[keep].tolist() for column in (t, x, y, p)], EDGES[:1], [])
+
+
+def test_a_part_that_begins_after_the_end_is_empty_and_says_so(recording: Path, tmp_path: Path) -> None:
+    answer = convert(recording, tmp_path / "out.raw", part=Slice(from_us=10**9))
+    assert (answer["events"], answer["first_us"]) == (0, None)
+    assert answer["warnings"] == ["nothing of the recording is in this part"]
+
+
+def test_a_cameras_own_words_stay_and_are_named_where_they_cannot(tmp_path: Path) -> None:
+    words = np.array(
+        [0x8001, 0xE014, 0xF009, 0xF000, 0x7000, 0xE016, 0xF004, 0xF000, 0x7000, 0xE0F1, 0x7001], np.uint16
+    )
+    with closing(RAW.create(tmp_path / "in.raw", "evt3", GEOMETRY, {})) as writer:
+        writer.write(CameraPacket(words, Encoding.EVT3, HostNs(0)))
+    same = convert(tmp_path / "in.raw", tmp_path / "same.raw")
+    assert (tmp_path / "same.raw").read_bytes().endswith(words.tobytes())
+    assert (same["lost"], same["warnings"]) == (5, ["the file holds no events"])
+    other = convert(tmp_path / "in.raw", tmp_path / "other.raw", word="evt2")
+    assert "not carried over: the rate controller's counts, 1 words of the camera about itself" in other["warnings"]
+
+
+def test_times_that_do_not_fit_are_moved_by_whole_seconds(tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", t=[1_700_000_000_123_456, 1_700_000_000_123_460], x=[1, 2], y=[3, 4], p=[0, 1])
+    answer = convert(tmp_path / "in.npz", tmp_path / "out.raw")
+    assert answer["shift_us"] == 1_699_999_999_000_000
+    assert read_all(tmp_path / "out.raw")[0] == [[1_123_456, 1_123_460], [1, 2], [3, 4], [0, 1]]
+    assert any("were subtracted" in warning for warning in answer["warnings"])
+    assert (answer["width"], answer["height"]) == (3, 5)
+    assert any("--geometry" in warning for warning in answer["warnings"])
+
+
+def test_the_size_can_be_given(elpd: Callable[..., Answer], tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", t=[1, 2], x=[1, 2], y=[3, 4], p=[0, 1])
+    answer = elpd("convert", "in.npz", "out.raw", "--geometry", "640x480", "--json").json
+    assert (answer["width"], answer["height"], answer["warnings"]) == (640, 480, [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        (["in.raw", "old.raw"], "UsageError", "old.raw exists; give another name, or --force"),
+        (["in.raw", "in.raw", "--force"], "UsageError", "same file"),
+        (["in.raw", "absent/out.raw"], "UsageError", "there is no folder"),
+        (["in.raw", "."], "UsageError", "no format is usually called"),
+        (["in.raw", "out.mp3"], "UsageError", "known are ."),
+        (["in.raw", "out"], "UsageError", "without a suffix"),
+        (["in.raw", "out.raw", "--format", "evt9"], "UsageError", "'evt9' cannot be written; known are "),
+        (["absent.raw", "out.raw"], "FormatError", "No such file"),
+        (["old.raw", "out.raw"], "FormatError", "in no format"),
+        (["in.raw", "out.raw", "--roi", "60,0,20,20"], "UsageError", "does not fit the sensor of 64x48"),
+        (["in.raw", "out.raw", "--from-us", "9", "--to-us", "9"], "UsageError", "must be later"),
+        (["in.raw", "out.raw", "--geometry", "0x9"], "UsageError", "WxH"),
+        (["in.raw", "out.raw", "--geometry", "4000x9"], "FormatError", "11-bit"),
+    ],
+)
+def test_what_cannot_be_done_is_told_and_leaves_nothing(
+    elpd: Callable[..., Answer], recording: Path, tmp_path: Path, arguments: list[str], kind: str, message: str
+) -> None:
+    (tmp_path / "old.raw").write_text("old\n")
+    before = recording.read_bytes()
+    answer = elpd("convert", *arguments, "--json")
+    assert (answer.code, answer.json["error"]["kind"]) == (2, kind)
+    assert message in answer.json["error"]["message"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.raw", "old.raw"]
+    assert ((tmp_path / "old.raw").read_text(), recording.read_bytes()) == ("old\n", before)
+
+
+def test_a_source_that_fails_in_the_middle_leaves_nothing(tmp_path: Path) -> None:
+    rows = [[5, 1, 1, 1]] * 200_000 + [[17_000_000, 1, 1, 1], [10, 1, 1, 1]]
+    np.save(tmp_path / "in.npy", np.array(rows))
+    with pytest.raises(UsageError, match="steps back from 17000000 to 10 us"):
+        convert(tmp_path / "in.npy", tmp_path / "out.raw")
+    assert [path.name for path in tmp_path.iterdir()] == ["in.npy"]
+
+
+def test_a_file_that_came_into_being_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    def write_while_another_does() -> None:
+        with appearing_whole(tmp_path / "out.raw", force=False) as partial:
+            partial.write_text("ours")
+            (tmp_path / "out.raw").write_text("theirs")
+
+    with pytest.raises(UsageError, match="exists"):
+        write_while_another_does()
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["theirs"]
+
+
+def test_memory_stays_bounded_whatever_the_files_length(tmp_path: Path) -> None:
+    columns = many(60_000, geometry=Geometry(1280, 720), step_us=3)
+
+    def peak(times: int) -> int:
+        source = tmp_path / f"{times}.raw"
+        with closing(RAW.create(source, "evt3", Geometry(1280, 720), {})) as writer:
+            for k in range(times):
+                writer.write(packet([columns[0] + k * 200_000, *columns[1:]]))
+        return peak_bytes(lambda: convert(source, tmp_path / f"{times}-out.raw", word="evt2"))
+
+    short, long = peak(10), peak(40)
+    assert (tmp_path / "40.raw").stat().st_size > 10_000_000
+    assert long < 1.2 * short

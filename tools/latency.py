@@ -1,0 +1,336 @@
+"""How long a stop takes to leave: ``python tools/latency.py [--board tic] [--json]``. Prints; asserts nothing.
+
+Two tables, each privileged (SCHED_FIFO, memory locked) where this user may, and not.
+
+*Stops*: from the call of ``lens.stop`` to the return of the write that hands its bytes to the port, a pty with a
+simulated board of another process behind it. While nothing else happens but polling, while a flood of replies waits
+unread in the port, and while another thread of this process computes in Python.
+
+*Reactions*: another process writes EVT3 words of a real recording, or made ones, into a socket, packet by packet, each
+with the instant of writing. This one waits for it, sums the packet's windows, feeds the detector and writes stop bytes
+to a pty. ``sent`` is counted from the writing, so it holds the sender's and the kernel's moods; ``own`` from the return
+of the wait, which is what this program is answerable for. The machine's own noise is measured beside it: the gaps in a
+loop that only looks at the clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import json
+import multiprocessing
+import os
+import pty
+import select
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import tty
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from elpd_drivers.lenses.serial_port import SerialPort
+
+from elpd import rig
+from elpd.config import load
+from elpd.events.evt3_encode import Evt3Encoder
+from elpd.events.stream import open_recording
+from elpd.records import CameraPacket, ElpSample, Encoding, Geometry, StopMode
+from elpd.timebase import MonotonicClock
+from elpd.units import HostNs
+from elpd.vision.detector import Detector
+from elpd.vision.elp import ElpWindows
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+PRIORITY = 70
+SWITCH_S = 5e-5
+WINDOW_US = 1000
+SENSOR = Geometry(1280, 720)
+QUESTIONS = {"tic": b"\xa1\x22\x08", "grbl": b"?", "tmcl": bytes((1, 6, 1, 0, 0, 0, 0, 0, 8)), "zaber": b"/get pos\n"}
+"""What makes each board talk, for the flood."""
+FLOOD = 500
+PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, nargs="?", help="an EVT3 recording for the reactions")
+    parser.add_argument("--board", choices=sorted(QUESTIONS), default="tic")
+    parser.add_argument("--stops", type=int, default=1000, help="per row")
+    parser.add_argument("--packets", type=int, default=3000, help="per row")
+    parser.add_argument("--words", type=int, default=2000, help="per packet")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    arguments = parser.parse_args()
+    sys.setswitchinterval(SWITCH_S)
+    words = _words(arguments.file, arguments.words)
+    answer: dict[str, Any] = {
+        "board": arguments.board,
+        "words_per_packet": arguments.words,
+        "stops": [],
+        "reactions": [],
+    }
+    for privileged in (True, False):
+        with ExitStack() as privileges:
+            refused = privileges.enter_context(realtime()) if privileged else None
+            if refused is not None:
+                answer["unprivileged_only"] = refused
+                continue
+            common = {"privileged": privileged}
+            floor = noise_floor()
+            for condition in CONDITIONS:
+                spent = stops(arguments.board, condition, arguments.stops)
+                answer["stops"].append({**common, "condition": condition, **_summary("call_to_written", spent)})
+            sent, own = reactions(words, arguments.words, arguments.packets)
+            figures = {**_summary("sent", sent), **_summary("own", own), **_summary("machine_gap", floor)}
+            answer["reactions"].append({**common, **figures})
+    print(json.dumps(answer) if arguments.json else _table(answer))
+    return 0
+
+
+# --- stops ---------------------------------------------------------------------------------------------------------
+
+
+class StampedPort:
+    """A serial port that notes when its last write was done."""
+
+    def __init__(self, path: str) -> None:
+        self._port = SerialPort(path, 115_200)
+        self.written_ns = 0
+
+    def write(self, data: bytes) -> None:
+        """Write and note."""
+        self._port.write(data)
+        self.written_ns = time.monotonic_ns()
+
+    def read_available(self) -> bytes:
+        """Read."""
+        return self._port.read_available()
+
+    def close(self) -> None:
+        """Close."""
+        self._port.close()
+
+
+def stops(board: str, condition: str, count: int) -> NDArray[np.float64]:
+    """Return the microseconds from the call of ``stop`` to its bytes' handing over, *count* times."""
+    with simulated_board(board) as path:
+        port = StampedPort(path)
+        config = load(None, [f"lens.driver={board}"])
+        settings = {"um_per_step": config.lens.um_per_step, "reply_ms": 5000.0}
+        if board == "grbl":
+            settings |= {"connect_ms": 20_000.0, "trust_position": True}
+        lens = rig.find("elpd.lenses", board)(settings, MonotonicClock(), port)
+        spent = np.zeros(count)
+        try:
+            with CONDITIONS[condition]():
+                for turn in range(count):
+                    if condition == "replies flood in":
+                        if turn % FLOOD == 0:
+                            port.read_available()
+                            port.write(QUESTIONS[board] * FLOOD)
+                    else:
+                        lens.poll()
+                        time.sleep(0.001)
+                    begun = time.monotonic_ns()
+                    lens.stop(StopMode.RAMPED)
+                    spent[turn] = (port.written_ns - begun) / 1e3
+        finally:
+            lens.close()
+    return spent
+
+
+@contextmanager
+def simulated_board(board: str) -> Iterator[str]:
+    """Serve a board from another process."""
+    command = [sys.executable, "-m", "elpd", "sim-board", board, "--json"]
+    more = ["--set", "board.referenced=true"]
+    with subprocess.Popen([*command, *more], stdout=subprocess.PIPE, text=True) as process:  # noqa: S603  (our own)
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())["port"]
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def busy_thread() -> Iterator[None]:
+    """Let another thread of this process compute."""
+    ended = threading.Event()
+
+    def compute() -> None:
+        while not ended.is_set():
+            sum(range(1000))
+
+    thread = threading.Thread(target=compute, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+CONDITIONS: dict[str, Callable[[], Any]] = {
+    "reader idle": ExitStack,
+    "replies flood in": ExitStack,
+    "a thread computes": busy_thread,
+}
+
+
+# --- reactions -----------------------------------------------------------------------------------------------------
+
+
+def reactions(words: NDArray[np.uint16], per_packet: int, packets: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the microseconds from writing, and from waking, to the stop bytes' writing, for each packet."""
+    windows = ElpWindows(np.ones((SENSOR.height, SENSOR.width), np.int16), window_us=WINDOW_US)
+    detector = Detector()
+    ours, theirs = socket.socketpair()
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    stop_bytes = bytes((0x89,))
+    buffer = bytearray(8 + 2 * per_packet)
+    view = memoryview(buffer)
+    sent, own = np.zeros(packets), np.zeros(packets)
+    sender = multiprocessing.get_context("fork").Process(target=send, args=(theirs, words, per_packet, packets + 50))
+    sender.start()
+    waiting = select.poll()
+    waiting.register(ours, select.POLLIN)
+    try:
+        for turn in range(-50, packets):  # the first fifty warm up
+            waiting.poll()
+            woken = time.monotonic_ns()
+            filled = 0
+            while filled < len(buffer):
+                filled += ours.recv_into(view[filled:])
+            stamp = struct.unpack_from("<q", buffer)[0]
+            payload = np.frombuffer(buffer, np.uint16, offset=8)
+            packet = CameraPacket(encoding=Encoding.EVT3, data=payload, received_ns=HostNs(woken))
+            for row in windows.feed(packet):
+                detector.feed(ElpSample(*row.item()))
+            os.write(slave, stop_bytes)
+            done = time.monotonic_ns()
+            if turn >= 0:
+                sent[turn], own[turn] = (done - stamp) / 1e3, (done - woken) / 1e3
+            with suppress(BlockingIOError):
+                os.read(master, 64)
+    finally:
+        sender.terminate()
+        sender.join()
+        for end in (ours, theirs):
+            end.close()
+        os.close(master)
+        os.close(slave)
+    return sent, own
+
+
+def send(socket_end: socket.socket, words: NDArray[np.uint16], per_packet: int, packets: int) -> None:
+    """Write packets, one each half millisecond, each behind the instant of its writing."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    n_pieces = len(words) // per_packet
+    for turn in range(packets):
+        piece = words[(turn % n_pieces) * per_packet :][:per_packet].tobytes()
+        time.sleep(0.0005)
+        socket_end.sendall(struct.pack("<q", time.monotonic_ns()) + piece)
+
+
+def _words(path: Path | None, per_packet: int) -> NDArray[np.uint16]:
+    """Take the beginning of a recording, or make events at random."""
+    wanted = 500 * per_packet
+    if path is not None:
+        pieces, have = [], 0
+        reader = open_recording(path)
+        for packet in reader.packets():
+            pieces.append(np.array(packet.data).view(np.uint16))
+            have += len(pieces[-1])
+            if have >= wanted:
+                break
+        reader.close()
+        return np.concatenate(pieces)[:wanted]
+    rng = np.random.default_rng(1)
+    count = wanted
+    t = np.sort(rng.integers(0, 200_000, count))
+    x, y = rng.integers(0, SENSOR.width, count), rng.integers(0, SENSOR.height, count)
+    encoder = Evt3Encoder(SENSOR.width)
+    return encoder.encode(t, x.astype(np.uint16), y.astype(np.uint16), rng.integers(0, 2, count).astype(np.uint8))[
+        :wanted
+    ]
+
+
+# --- the machine ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def realtime() -> Iterator[str | None]:
+    """Ask for SCHED_FIFO and locked memory; yield why not, where it is refused."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except PermissionError:
+        yield "SCHED_FIFO was refused (needs CAP_SYS_NICE or LimitRTPRIO)"
+        return
+    libc.mlockall(3)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield None
+    finally:
+        gc.enable()
+        gc.unfreeze()
+        libc.munlockall()
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def noise_floor(seconds: float = 0.5) -> NDArray[np.float64]:
+    """Return the gaps between looks at the clock, in microseconds: what the machine alone takes away."""
+    gaps = []
+    before = begun = time.monotonic_ns()
+    while before - begun < seconds * 1e9:
+        now = time.monotonic_ns()
+        gaps.append((now - before) / 1e3)
+        before = now
+    return np.array(gaps)
+
+
+def _summary(name: str, spent_us: NDArray[np.float64]) -> dict[str, float]:
+    values = np.percentile(spent_us, PERCENTILES)
+    keys = ("p50", "p99", "p99_9", "max")
+    return {f"{name}_{key}_us": round(float(value), 1) for key, value in zip(keys, values, strict=True)}
+
+
+def _table(answer: dict[str, Any]) -> str:
+    lines = [f"stops on a {answer['board']} board: call to bytes handed over, us", f"{'':34s}{_HEAD}"]
+    for row in answer["stops"]:
+        who = "privileged" if row["privileged"] else "ordinary"
+        lines.append(f"{who:12s}{row['condition']:22s}{_figures(row, 'call_to_written')}")
+    lines += ["", f"packets of {answer['words_per_packet']} words: to the stop byte written, us", f"{'':34s}{_HEAD}"]
+    for row in answer["reactions"]:
+        who = "privileged" if row["privileged"] else "ordinary"
+        for name, words in (("own", "from waking"), ("sent", "from the sender"), ("machine_gap", "the machine's gaps")):
+            lines.append(f"{who:12s}{words:22s}{_figures(row, name)}")
+    if "unprivileged_only" in answer:
+        lines.append(answer["unprivileged_only"])
+    return "\n".join(lines)
+
+
+_HEAD = "".join(f"{name:>9s}" for name in ("p50", "p99", "p99.9", "max"))
+
+
+def _figures(row: dict[str, Any], name: str) -> str:
+    return "".join(f"{row[f'{name}_{key}_us']:9.1f}" for key in ("p50", "p99", "p99_9", "max"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
