@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import structlog
 from aiohttp import web
 
+from elpd.errors import ElpdError
 from elpd.web import pages
-from elpd.web.commands import COMMANDS, QUESTIONS, STATUS_OF, Desk
-from elpd.web.link import DaemonError
+from elpd.web.commands import COMMANDS, QUESTIONS, STATUS_OF, Desk, kind_of
 from elpd.web.relay import Relay
 from elpd.web.security import HEADERS, Gate
 
@@ -87,8 +87,9 @@ async def _judge(
         return _error(refusal.status, "Refused", refusal.message)
     try:
         return await handler(request)
-    except DaemonError as error:
-        return _error(STATUS_OF.get(error.kind, 500), error.kind, str(error))
+    except ElpdError as error:
+        kind = kind_of(error)
+        return _error(STATUS_OF.get(kind, 500), kind, str(error))
     except web.HTTPException as error:
         return _error(error.status, "UsageError", error.text or error.reason)
 
@@ -155,7 +156,7 @@ async def _events(request: web.Request) -> web.StreamResponse:
     """Stream to one tab: many small events go out together, thirty times a second at most."""
     relay, streams = request.app[RELAY], request.app[STREAMS]
     if relay.tabs >= MAX_TABS:
-        return _error(503, "TooMany", f"{MAX_TABS} pages are open already; close some")
+        return _error(503, "Busy", f"{MAX_TABS} pages are open already; close some")
     response = web.StreamResponse(headers={"Content-Type": "text/event-stream", "X-Accel-Buffering": "no"})
     tab = relay.join(request.headers.get("Last-Event-ID"))
     task = asyncio.current_task()

@@ -39,7 +39,7 @@ async function stop() {
     settle("done", "Stopped");
   } catch (error) {
     settle("failed", "Not stopped");
-    trouble(`STOP did not get through: ${error.message} If anything moves, use the rig's own switch.`, { lasting: true });
+    trouble(`STOP did not get through: ${error.message}`, { lasting: true });
   }
 
   function settle(how, text) {
