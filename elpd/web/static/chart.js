@@ -7,7 +7,7 @@ import { columns, crossing, ways } from "./curve.js";
 const SHOWN_WAYS = 4;
 
 const ink = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-const FONT = "11px system-ui, sans-serif";
+const FONT_PX = 11;
 
 /** A chart in `place`; `tell(text)` hears what is under the cursor. */
 export function createChart(place, tell = () => {}) {
@@ -21,16 +21,16 @@ export function createChart(place, tell = () => {}) {
       series.push({ stroke: colours[nth], width: nth === 0 ? 2 : 1.4, spanGaps: true, points: { show: false } });
       series.push({ paths: () => null, points: { show: true, size: 2.5, fill: colours[nth], stroke: colours[nth], width: 0 } });
     }
-    const axis = { stroke: ink("quiet"), font: FONT, grid: { stroke: ink("line"), width: 1 }, ticks: { show: false } };
+    const axis = { stroke: ink("quiet"), font: `${FONT_PX}px ${getComputedStyle(place).fontFamily}`, grid: { stroke: ink("line"), width: 1 }, ticks: { show: false } };
     return {
       width: place.clientWidth || 320,
       height: place.clientHeight || 220,
-      padding: [14, 10, 0, 0],
+      padding: [18, 26, 0, 0],
       legend: { show: false },
       cursor: { drag: { x: false, y: false }, points: { show: false }, y: false },
       scales: { x: { time: false, range: spanX }, y: { range: spanY } },
       axes: [
-        { ...axis, size: 30, gap: 4, values: (_, values) => values.map((value) => `${value}`) },
+        { ...axis, size: 30, gap: 4, values: (_, values) => values.map((value, nth) => (nth === values.length - 1 ? `${value} µm` : `${value}`)) },
         { ...axis, size: 44, gap: 4, values: (_, values) => values.map(short) },
       ],
       series,
@@ -107,7 +107,7 @@ export function createChart(place, tell = () => {}) {
   function label(self, x, text, colour) {
     const { ctx } = self;
     ctx.save();
-    ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.font = `500 ${FONT_PX * devicePixelRatio}px ${getComputedStyle(place).fontFamily}`;
     const width = ctx.measureText(text).width;
     const left = Math.min(Math.max(x - width / 2, self.bbox.left), self.bbox.left + self.bbox.width - width);
     ctx.fillStyle = colour;

@@ -33,6 +33,7 @@ export function mountFocus(store, { act }) {
     const may = live(state) && state.link.role !== "observe";
     $("focus").disabled = !may || running || state.fault !== null || state.state !== "READY";
     say($("focus"), running ? "Focusing…" : $("dry-run").checked ? "Try without moving" : "Focus");
+    $("focus").dataset.busy = running ? "yes" : "";
     show($("cancel"), running);
     phases(state, steps);
     result(state.cycle?.result ?? null);

@@ -29,6 +29,7 @@ export function mountPicture(store) {
     commit: (box) => setRegion(box),
     changed(box) {
       for (const field of FIELDS) if (document.activeElement !== $(`roi-${field}`)) $(`roi-${field}`).value = box ? box[field] : "";
+      say($("region-summary"), box ? `Region ${text(box)}` : "Drag on the picture to choose a region; elpd chooses one otherwise.");
     },
   });
 
@@ -78,7 +79,9 @@ export function mountPicture(store) {
       const answer = await command("roi", { set: box, ...(name ? { name } : {}) });
       if (!name) {
         const used = answer.roi;
-        echo(used === null ? "elpd chooses the region." : same(used, box) ? `Region ${used.width} × ${used.height} at ${used.x}, ${used.y}.` : `Cut to the sensor: ${used.width} × ${used.height} at ${used.x}, ${used.y}.`);
+        if (used !== null && !same(used, box)) echo(`Cut to the sensor: ${text(used)}.`);
+        else echo("");
+        speak(used === null ? "elpd chooses the region" : `Region ${text(used)}`);
       }
       takeRegions(answer);
     } catch (error) {
@@ -96,9 +99,8 @@ export function mountPicture(store) {
     named = answer.named;
     editor.set(known);
     const options = Object.keys(named).map((name) => make("option", { value: name, textContent: name }));
-    $("roi-named").replaceChildren(make("option", { value: "", textContent: "saved…" }), ...options);
+    $("roi-named").replaceChildren(make("option", { value: "", textContent: options.length ? "choose…" : "none" }), ...options);
     $("roi-named").disabled = options.length === 0;
-    for (const part of ["from-label"]) show($(part), $("from").options.length > 1);
   }
 
   $("kinds").addEventListener("change", (event) => {
@@ -127,10 +129,10 @@ export function mountPicture(store) {
     event.target.value = "";
   });
   $("roi-save").addEventListener("click", () => {
-    const box = editor.get();
-    if (!box) return echo("There is no region to save; draw one first.");
-    const name = prompt("A name for this region: letters, digits and _ . -");
-    if (name) setRegion(box, name.trim());
+    const [box, name] = [editor.get(), $("roi-name").value.trim()];
+    if (!box) echo("There is no region to save; draw one first.");
+    else if (!name) $("roi-name").focus();
+    else setRegion(box, name).then(() => ($("roi-name").value = ""));
   });
   document.addEventListener("visibilitychange", refresh);
 
@@ -156,6 +158,8 @@ export function mountPicture(store) {
   });
   return { giveUp: () => editor.giveUp() };
 }
+
+const text = (box) => `${box.width} × ${box.height} at ${box.x}, ${box.y}`;
 
 const KINDS = { map: "Temporal map", frame: "Frame", events: "Events" };
 
