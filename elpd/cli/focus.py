@@ -41,8 +41,8 @@ def command(
         reference=_reference_path(reference, config),
         dry_run=dry_run,
     )
-    from elpd.record.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
     from elpd.cli.view import open_view  # noqa: PLC0415
+    from elpd.record.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
 
     with interruptible() as cancelled:
         if as_json:

@@ -70,9 +70,9 @@ class Work:
             case "home":
                 return self._home(job, parts)
             case "move":
-                return _moved(self._move(job, _target_um(params, parts), parts, config))
+                return self._moved(job, params, parts, config)
             case "jog":
-                return _moved(self._jog(job, params, parts, config))
+                return _at(self._jog(job, params, parts, config))
             case "preset":
                 return self._apply(job, params, parts, config)
             case "record":
@@ -122,9 +122,17 @@ class Work:
                 arrival = self._errands(job, parts).home(1000.0 * HOME_LIMIT_S)
             except LensError as error:
                 if job.cancelled:
-                    raise UnreferencedError(f"homing was stopped on request, the lens must be homed again: {error}") from None
+                    raise UnreferencedError(f"homing was stopped on request; home the lens again ({error})") from None
                 raise
         return HomeAnswer(position_um=arrival.um)
+
+    def _moved(self, job: Job, params: MoveParams, parts: RigParts, config: Config) -> MoveAnswer:
+        """Go there; what the daemon does by itself keeps to the side that focus was found from."""
+        target_um = _target_um(params, parts)
+        if not job.automatic:
+            return _at(self._move(job, target_um, parts, config))
+        then = self._kept.content.thermometer
+        return _at(self.approach(job, target_um, 0 if then is None else then.sign, parts, config))
 
     def _move(self, job: Job, target_um: float, parts: RigParts, config: Config) -> Arrival:
         speed_um_s = CycleSettings.from_config(config).speed_um_s
@@ -194,9 +202,8 @@ def _target_um(params: MoveParams, parts: RigParts) -> float:
     return low_um + params.fraction * (high_um - low_um)
 
 
-def _moved(arrival: Arrival) -> MoveAnswer:
-    outcome = "CANCELLED" if arrival.cancelled else "OK"
-    return MoveAnswer(position_um=arrival.um, sigma_um=None, outcome=outcome)
+def _at(arrival: Arrival) -> MoveAnswer:
+    return MoveAnswer(position_um=arrival.um, sigma_um=None, outcome="CANCELLED" if arrival.cancelled else "OK")
 
 
 def _roi(box: RoiBox | None) -> Roi | None:
