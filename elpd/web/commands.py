@@ -6,10 +6,11 @@ cancel have a connection of their own, so that nothing ever queues before them.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from elpd.client.aio import AsyncClient
-from elpd.errors import BusyError, ElpdError, UnreachableError
+from elpd.errors import BusyError, ElpdError, UnreachableError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,6 +19,9 @@ URGENT = frozenset({"stop", "cancel"})
 COMMANDS = URGENT | {"focus", "home", "move", "jog", "clear", "roi", "preset", "mode", "temperature", "record"}
 QUESTIONS = frozenset({"hello", "status", "runs", "run", "map", "metrics", "roi", "mode", "presets"})
 """What a GET may ask. ``roi`` and ``mode`` without parameters only read; ``presets`` is the list of ``preset``."""
+
+AUTO = ("frame", "map")
+"""What somebody who draws a region wants to see; the newest of what there is, if there is neither."""
 
 IN_FLIGHT = 6
 """The daemon allows eight requests in flight on a connection."""
@@ -63,6 +67,15 @@ class Desk:
     async def question(self, method: str, params: dict[str, Any]) -> Any:
         """Ask for something that only reads: a slow answer never stands before a command. Raises ``ElpdError``."""
         return await self._counted("question", self._looking, method, params)
+
+    async def picture(self, params: dict[str, Any]) -> Any:
+        """Ask for a picture; the kind ``auto`` is the first of those that there are. Raises ``ElpdError``."""
+        if params.get("kind") == "auto":
+            for kind in AUTO:
+                with suppress(UsageError):
+                    return await self.question("map", params | {"kind": kind})
+            params = params | {"kind": "latest"}
+        return await self.question("map", params)
 
     async def close(self) -> None:
         """Hang up."""

@@ -2,7 +2,8 @@
 
 ==============================  =================================================================================
 ``GET /`` and the page's files  open to whoever reaches the port; they hold no secret
-``GET /api/METHOD?name=value``  a question; ``map`` answers with the picture itself, ``metrics`` with text
+``GET /api/METHOD?name=value``  a question; ``map`` answers with the picture itself, ``metrics`` with text; ``map``
+                                also knows ``kind=auto``
 ``GET /api/events``             server-sent events: ``link reset status sample phase result fault state position
                                 dropped``; resumes after ``Last-Event-ID``
 ``POST /api/METHOD``            a command; the body holds its parameters
@@ -129,10 +130,10 @@ async def _question(request: web.Request) -> web.StreamResponse:
         return _error(404, "UsageError", f"there is no question {method!r}; there are {', '.join(sorted(QUESTIONS))}")
     if method in COMMANDS and request.query:
         return _error(405, "UsageError", f"{method} with parameters is a command; commands are sent with POST")
+    if method == "map":
+        return _picture(await request.app[DESK].picture(_query(request)))
     asked = ("preset", {"action": "list"}) if method == "presets" else (method, _query(request))
     answer = await request.app[DESK].question(*asked)
-    if method == "map":
-        return _picture(answer)
     if method == "metrics":
         return web.Response(text=answer["text"], content_type="text/plain")
     return web.json_response(answer)

@@ -264,7 +264,9 @@ def test_warnings_have_a_title_and_the_daemons_sentence(opened: Opener, rig: Rig
 
 def test_who_may_only_watch_can_still_press_stop(opened: Opener, rig: Rig) -> None:
     opened.expected = (REFUSED,)
+    rig.stop()
     rig.put(role="observe")
+    rig.start()
     page = opened()
     expect(page.locator("#link-text")).to_have_text("watching only")
     for control in ("#focus", "#home", "#jog button >> nth=0", "#preset-form button"):

@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import re
+from typing import Any
 
 import aiohttp
 import pytest
@@ -156,6 +157,24 @@ def test_a_picture_is_sent_as_a_file_with_its_facts_in_a_header(format_: str, ma
             assert facts["sensor"] == {"width": 1280, "height": 720}
             assert (facts["width"], facts["height"]) == (640, 360)
             assert "image" not in facts
+
+    run(story())
+
+
+@pytest.mark.parametrize(("there", "shown"), [("frame map", "frame"), ("map events", "map"), ("events", "events")])
+def test_the_picture_to_draw_on_is_a_frame_else_the_map_else_what_there_is(there: str, shown: str) -> None:
+    async def story() -> None:
+        async with gateway() as here:
+
+            def picture(params: dict[str, Any]) -> dict[str, Any]:
+                kind = params["kind"]
+                if kind not in {"latest", *there.split()}:
+                    raise Refused("UsageError", f"there is no picture of kind {kind!r} yet")
+                return {**here.daemon._map(**params), "kind": shown if kind == "latest" else kind}
+
+            here.daemon.answers["map"] = picture
+            async with here.get("/api/map?kind=auto") as answer:
+                assert json.loads(answer.headers["X-Elpd-Picture"])["kind"] == shown
 
     run(story())
 

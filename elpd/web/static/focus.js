@@ -54,7 +54,7 @@ export function mountFocus(store, { act }) {
 
 function summary(crossed, found, windows) {
   const parts = [`${windows} windows`];
-  if (crossed !== null) parts.push(`ELP crossed zero at ${um(crossed, 1)} µm, later than focus by physics`);
+  if (crossed !== null) parts.push(`ELP crossed zero at ${um(crossed, 1)} µm`);
   if (found !== null) parts.push(`focus measured at ${um(found, 1)} µm`);
   return `${parts.join(" · ")}.`;
 }
@@ -99,6 +99,6 @@ export function resultFacts(ended) {
     ["reversals", String(ended.reversals)],
     ["events", ended.events.toLocaleString()],
     ["lost", ended.lost ? ended.lost.toLocaleString() : null],
-    ["true error", ended.truth?.final_error_um === undefined || ended.truth?.final_error_um === null ? null : `${um(ended.truth.final_error_um)} µm (simulated)`],
+    ["true error (sim)", ended.truth?.final_error_um === undefined || ended.truth?.final_error_um === null ? null : `${um(ended.truth.final_error_um)} µm`],
   ];
 }

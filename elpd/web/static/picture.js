@@ -15,7 +15,8 @@ const LIVE = new Set(["frame", "events"]);
 const FIELDS = ["x", "y", "width", "height"];
 
 export function mountPicture(store) {
-  let kind = "latest";
+  let kind = "auto"; // a frame where there are any, else the map, else what the camera just saw
+  let typing = false;
   let shown = null; // the facts of what is shown
   let timer = null;
   let asking = false;
@@ -24,11 +25,12 @@ export function mountPicture(store) {
   let named = {};
   let wasLive = false;
   let lastResult = null;
+  let wasMade = false;
 
   const editor = regionEditor($("region"), {
     commit: (box) => setRegion(box),
     changed(box) {
-      for (const field of FIELDS) if (document.activeElement !== $(`roi-${field}`)) $(`roi-${field}`).value = box ? box[field] : "";
+      if (!typing) for (const field of FIELDS) $(`roi-${field}`).value = box ? box[field] : "";
       say($("region-summary"), box ? `Region ${text(box)}` : "Drag on the picture to choose a region; elpd chooses one otherwise.");
     },
   });
@@ -56,7 +58,7 @@ export function mountPicture(store) {
     } finally {
       asking = false;
     }
-    const soon = again ? 0 : LIVE.has(kind) || shown?.kind === "frame" ? LIVE_MS : SLOW_MS;
+    const soon = again ? 0 : LIVE.has(kind) || LIVE.has(shown?.kind) ? LIVE_MS : SLOW_MS;
     again = false;
     timer = setTimeout(refresh, soon);
   }
@@ -75,6 +77,7 @@ export function mountPicture(store) {
   }
 
   async function setRegion(box, name) {
+    typing = false;
     try {
       const answer = await command("roi", { set: box, ...(name ? { name } : {}) });
       if (!name) {
@@ -122,6 +125,7 @@ export function mountPicture(store) {
     if (values.some((value) => !Number.isFinite(value))) echo("Four whole numbers make a region: x, y, width, height.");
     else setRegion(Object.fromEntries(FIELDS.map((field, nth) => [field, Math.round(values[nth])])));
   });
+  for (const field of FIELDS) $(`roi-${field}`).addEventListener("input", () => (typing = true));
   $("roi-clear").addEventListener("click", () => setRegion(null));
   $("roi-named").addEventListener("change", (event) => {
     const box = named[event.target.value];
@@ -144,15 +148,16 @@ export function mountPicture(store) {
     }
     wasLive = now;
     editor.enable(now && state.link.role !== "observe");
-    show($("kind-frame"), state.status?.camera.has_frames !== false);
+    show($("kind-frame"), Boolean(state.status?.camera.has_frames));
     const region = state.status?.roi;
     if (region !== undefined && known !== undefined && !same(region, known)) {
       known = region; // somebody else set it
       editor.set(known);
     }
     const result = state.cycle?.result ?? null;
-    const mapMade = state.cycle?.phase === "choose";
-    if ((result && result !== lastResult) || mapMade) refresh();
+    const mapMade = Boolean(state.cycle?.seen.includes("probe"));
+    if ((result && result !== lastResult) || (mapMade && !wasMade)) refresh();
+    wasMade = mapMade;
     if (result && result !== lastResult && result.outcome) speak(`${result.outcome.toLowerCase().replaceAll("_", " ")}: ${result.reason}`);
     lastResult = result;
   });
