@@ -55,7 +55,7 @@ def command(
     as_json: bool,
     config_path: Path | None,
     overrides: tuple[str, ...],
-) -> None:
+) -> int:
     """Make an HDR picture from the first ON event of each pixel while an aperture opened.
 
     The default profile is an iris: what lenses have, and what the method's authors assume. A wrong profile stretches
@@ -87,6 +87,7 @@ def command(
         print_json(answer)
     else:
         _tell(image, out, "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
+    return 0 if usable else 1
 
 
 def _parse_size(text: str | None) -> Geometry | None:

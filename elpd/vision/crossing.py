@@ -209,6 +209,8 @@ def ask_events(
     *brightness* does not show, relative to the brightest parts.
     """
     weight, slowness = _by_brightness(brightness, events, dark)
+    if brightness is None and calibrated is not None:
+        calibrated = calibrated.unseen()
     groups = by_pixel(events)
     at_peak = rebuilt(events, groups, np.array([peak]))[0]
     slownesses = _slownesses(start, at_peak, slowness)
