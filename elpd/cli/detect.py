@@ -133,7 +133,14 @@ def command(
         file = path_of(state_directory(config), SensorCalibration) if sensor == "stored" else Path(sensor)
         known = sensor_of_file(file, sweep.geometry)
     search = SweepSearch(
-        sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference, sensor=known
+        sweep,
+        roi,
+        ruler,
+        depth_of_focus_um=dof_um,
+        begin_us=begin_us,
+        reference=reference,
+        sensor=known,
+        max_sigma_dof=config.focus.max_sigma_dof,
     )
     return _finish(search.run(), as_json=as_json)
 
