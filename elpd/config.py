@@ -124,8 +124,8 @@ class ApiSection(_Section):
 
     socket: Path | None = None
     """``/run/elpd/elpd.sock`` where that folder can be written, else ``$XDG_RUNTIME_DIR/elpd/elpd.sock``."""
-    operators: str = "elpd"
-    """The group whose members may operate; others who can open the socket observe."""
+    operators: str | None = None
+    """A group whose members may operate, beside root and the daemon's own user; whoever else gets in may look."""
 
 
 class ModesSection(_Section):
