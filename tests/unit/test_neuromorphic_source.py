@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from elpd_drivers.cameras import neuromorphic
-from elpd_drivers.cameras.neuromorphic import NeuromorphicSettings, NeuromorphicSource
+from elpd_drivers.cameras import neuromorphic, neuromorphic_tables
+from elpd_drivers.cameras.neuromorphic import NeuromorphicSource
+from elpd_drivers.cameras.neuromorphic_tables import NeuromorphicSettings
 
 from elpd.errors import CameraError, ConfigError
 from elpd.records import Encoding, Geometry
@@ -73,7 +74,7 @@ class Device:
 def source(device: Device, **settings: Any) -> NeuromorphicSource:
     table = NeuromorphicSettings.model_validate(settings)
     module = MODULES[device.kind]
-    configuration = neuromorphic._configured(module, table)
+    configuration = neuromorphic_tables.configured(module, table)
     return NeuromorphicSource(device, module, device.kind, configuration, table)
 
 
@@ -176,7 +177,7 @@ def test_settings_that_a_camera_has_not_are_refused() -> None:
     bounds = replace(nd.prophesee_evk4.BiasesBounds(), diff_on=nd.prophesee_evk4.Bounds(-35, 10))
     table = NeuromorphicSettings.model_validate({"biases": {"focus": {"diff_on": 11}}})
     with pytest.raises(ConfigError, match=r"diff_on: 11 is outside what this prophesee evk4 takes, -35 to 10"):
-        neuromorphic._check_bounds(table.biases, bounds, "prophesee_evk4")
+        neuromorphic_tables.check_bounds(table.biases, bounds, "prophesee_evk4")
 
 
 def listing(*devices: tuple[str, str | None, str | None]) -> Any:
@@ -196,9 +197,9 @@ def listing(*devices: tuple[str, str | None, str | None]) -> Any:
 )
 def test_which_camera_is_meant_must_be_clear(there: Any, asked: dict[str, Any], reason: str) -> None:
     with pytest.raises(CameraError, match=reason):
-        neuromorphic._choose(listing(*there), NeuromorphicSettings.model_validate(asked))
+        neuromorphic_tables.choose(listing(*there), NeuromorphicSettings.model_validate(asked))
 
 
 def test_an_evk4_whose_type_was_not_read_at_first_is_listed_twice_and_meant_once() -> None:
     there = listing(("PROPHESEE_EVK3_HD", None, "Pipe error"), ("PROPHESEE_EVK4", "1", None))
-    assert neuromorphic._choose(there, NeuromorphicSettings()) == ("prophesee_evk4", "1")
+    assert neuromorphic_tables.choose(there, NeuromorphicSettings()) == ("prophesee_evk4", "1")

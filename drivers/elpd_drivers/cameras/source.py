@@ -34,7 +34,7 @@ class SourceFacts:
     """What is constant about an open camera.
 
     ``layout`` describes the event array's dtype (``numpy.dtype``'s dictionary of names, formats, offsets, itemsize) and
-    is ``None`` for words. ``abilities`` are keys of ``capture.ABILITIES``. ``min_latency_us`` is the shortest delay
+    is ``None`` for words. ``abilities`` are keys of ``abilities.ABILITIES``. ``min_latency_us`` is the shortest delay
     from an event to ``Captured.received_ns``.
     """
 
