@@ -77,7 +77,9 @@ def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSett
 
 
 def _begin(backend: str, settings: Mapping[str, Any], common: CaptureSettings) -> CaptureProcess:
-    return CaptureProcess(backend, settings, ring_mb=common.ring_mb, open_timeout_s=common.open_timeout_s)
+    return CaptureProcess(
+        backend, settings, ring_mb=common.ring_mb, open_timeout_s=common.open_timeout_s, hang_ms=common.hang_ms
+    )
 
 
 class CapturedCamera:
