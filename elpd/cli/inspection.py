@@ -127,11 +127,16 @@ def devices() -> list[Finding]:
         if not found:
             findings.append(Finding("devices", point.name, Status.NOTE, "nothing found"))
         for device in found:
-            data = {"kind": device.kind, "device": device.name, "where": device.where}
+            data = {
+                "kind": device.kind,
+                "device": device.name,
+                "where": device.where,
+                "drivers": list(device.drivers),
+            }
             status = Status.OK if device.next_step is None else Status.PROBLEM
-            findings.append(
-                Finding("devices", device.kind, status, f"{device.where}  {device.name}", device.next_step, data)
-            )
+            opened_by = f", driver = {' or '.join(device.drivers)}" if device.drivers else ""
+            told = f"{device.where}  {device.name}{opened_by}"
+            findings.append(Finding("devices", device.kind, status, told, device.next_step, data))
     return findings
 
 
@@ -192,9 +197,9 @@ def self_test(focus: Callable[[], dict[str, Any]]) -> Finding:
 
 def focus_simulated() -> dict[str, Any]:
     """Run one whole cycle on the default simulated rig, unrecorded."""
-    from elpd.record.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
     from elpd.config import Config  # noqa: PLC0415
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
+    from elpd.record.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
 
     config = Config.model_validate({"rig": "sim", "journal": {"enabled": False}, "sim": {"pace": 0.0}})
     return focus_once(config, FocusRequest()).fields()

@@ -184,10 +184,11 @@ class HomeAnswer(TypedDict):
 
 
 class MoveAnswer(TypedDict):
-    """``move``, ``jog``: at rest."""
+    """``move``, ``jog``: at rest, where it was sent or, *outcome* ``CANCELLED``, where it was stopped."""
 
     position_um: float
     sigma_um: float | None
+    outcome: Literal["OK", "CANCELLED"]
 
 
 class ClearAnswer(TypedDict):
@@ -210,6 +211,7 @@ class Preset(TypedDict):
     name: str
     position_um: float
     roi: RoiBox | None
+    approach: Literal[-1, 0, 1]
     saved_at: str
 
 

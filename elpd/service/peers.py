@@ -64,7 +64,7 @@ def _further_groups(connection: socket.socket) -> tuple[int, ...]:
     try:
         packed = connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, MOST_BYTES)
     except OSError:
-        return ()  # an older kernel, or more groups than anybody has: the first one counts
+        return ()  # an older kernel, or more than 256 groups: the first one counts
     return struct.unpack(f"{len(packed) // 4}I", packed)
 
 

@@ -19,20 +19,21 @@ import numpy as np
 from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
-from elpd.records import Encoding, Geometry, LensReport, Roi
+from elpd.records import Encoding, Geometry, LensReport, Roi, Trigger
 from elpd.scale import LensScale
 from elpd.units import Steps, after_ms
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
-from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, Wire
+from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, TriggerLine, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
+from elpd_drivers.sim.drift import Drift
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from elpd_drivers.sim.motion import SceneMotion
 from elpd_drivers.sim.optics import LAMP_SHAPES, DefocusStack, Lamp, Layer, LightField
 from elpd_drivers.sim.retina import OVEREXPOSED, ApsFrames, Retina
 from elpd_drivers.sim.scene import choose_scene, scene_canvas
 from elpd_drivers.sim.sensor import FOCUS, HOT_PIXEL_HZ, LAG_US_AT_FULL, MISMATCH_SD, BiasLevels, EventSensor
-from elpd_drivers.sim.world import World, random_stream
+from elpd_drivers.sim.world import BIRTH_NS, World, random_stream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +65,8 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in.
+    believes in. Focus moves along the travel by ``drift_um_s``. With ``sync_steps`` the board's sync line, which makes
+    an edge at every multiple of so many steps, is wired to the camera's trigger input, unless ``sync_cut``.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -122,9 +124,12 @@ class SimSettings:
     um_per_step: float = 0.3125
     steps_to_um: tuple[tuple[float, float], ...] = ()
     cam: float = 0.0
+    drift_um_s: float = 0.0
     backlash_um: float = 4.0
     acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
+    sync_steps: int = 0
+    sync_cut: bool = False
     # faults of the camera
     camera_vanishes_at_s: float | None = None
     camera_silent_from_s: float | None = None
@@ -145,6 +150,10 @@ class Evt3Wire:
         del begin_us
         words = self._encoder.encode(events.t_us, events.x, events.y, events.on).copy()
         return np.concatenate([words, self._encoder.encode_time(end_us)])
+
+    def encode_edge(self, edge: Trigger) -> NDArray[Any]:
+        """Return its words."""
+        return self._encoder.encode_trigger(edge.t_us, edge.id, rising=edge.rising).copy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +179,8 @@ class SimulatedTruth:
     ----------
     focus_carriage_um
         The carriage position of true focus, from the lower end stop.
+    drift
+        How far focus has moved since; tests move it.
     """
 
     def __init__(
@@ -186,6 +197,7 @@ class SimulatedTruth:
         geometry: Geometry,
         cam: Cam,
         scale: LensScale,
+        drift: Drift,
     ) -> None:
         self.world = world
         self.mechanism = mechanism
@@ -193,6 +205,7 @@ class SimulatedTruth:
         self.aperture = aperture
         self.focus_carriage_um = focus_carriage_um
         self.scene = scene
+        self.drift = drift
         self._lens = lens
         self._light = light
         self._geometry = geometry
@@ -213,7 +226,7 @@ class SimulatedTruth:
             self._cam.image_um(self.mechanism.carriage_um(now)),
             self._cam.image_um(np.float64(self.focus_carriage_um)),
         )
-        return float(here_um[0] - focus_um)
+        return float(here_um[0] - focus_um - self.drift.um(now)[0])
 
     def focus_um(self, sweep_sign: int) -> float | None:
         """Return focus on the motor's ruler while the carriage is pushed in a direction (+1, -1; 0: mid-play).
@@ -227,7 +240,8 @@ class SimulatedTruth:
         except LensError:
             return None
         mechanics = self.mechanism.mechanics
-        rotor_um = self.focus_carriage_um + sweep_sign * mechanics.backlash_um / 2
+        drift_um = float(self.drift.um(np.array([now], np.int64))[0])  # without a cam the two rulers are one
+        rotor_um = self.focus_carriage_um + drift_um + sweep_sign * mechanics.backlash_um / 2
         shift = round(count - self.mechanism.rotor_at(now))
         return self._scale.to_um(rotor_um / mechanics.um_per_step + shift)
 
@@ -259,6 +273,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     world = World(chosen.pace)
     focus_um, start_um = _place(chosen)
     mechanism = SimulatedLens(_mechanics(chosen), start_um=start_um)
+    drift = Drift(BIRTH_NS, chosen.drift_um_s)
     lens, port = _lens(chosen, world, mechanism)
     aperture = _aperture(chosen, world) if chosen.camera == "evk4" else None
     scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
@@ -267,7 +282,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     pan_px_s = (float(chosen.pan_px_s * np.cos(heading)), float(chosen.pan_px_s * np.sin(heading)))
     light = LightField(
         stack,
-        lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)),
+        lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)) - drift.um(times_ns),
         float(cam.image_um(np.float64(focus_um))),
         SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX, pan_px_s),
         aperture=aperture,
@@ -290,8 +305,11 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         geometry=geometry,
         cam=cam,
         scale=scale,
+        drift=drift,
     )
-    return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, scale, truth)
+    wired = chosen.sync_steps and not chosen.sync_cut
+    line = port.wire.board if wired and isinstance(port.wire.board, TriggerLine) else None
+    return RigParts(world, _camera(chosen, world, light, geometry, line), lens, aperture, scale, truth)
 
 
 def _stack(scene: str, geometry: Geometry, brightness: float) -> DefocusStack:
@@ -326,6 +344,8 @@ def _geometry(chosen: SimSettings) -> Geometry:
             f"sim.lag_us is {chosen.lag_us:g} and must be more than 0; sim.mismatch is {chosen.mismatch:g} and must "
             f"lie in 0 to {LARGEST_MISMATCH:g}, or some pixels would have no threshold"
         )
+    if chosen.drift_um_s and chosen.cam:
+        raise ConfigError("sim.drift_um_s and sim.cam do not go together: the truth would not know where focus is")
     if chosen.depth_of_focus_um <= 0 or chosen.brightness <= 0:
         raise ConfigError("sim.depth_of_focus_um and sim.brightness must be more than 0; use sim.cap for darkness")
     if chosen.flicker_shape not in LAMP_SHAPES or not 0 <= chosen.flicker_depth <= 1:
@@ -367,6 +387,10 @@ def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[
     wanted = Wanted(chosen.um_per_step, chosen.travel_um, 3 * chosen.speed_um_s, chosen.acceleration_um_s2)
     port, table = fitted(chosen.board, mechanism, wanted, world, seed=chosen.seed)
     world.add(port)
+    if chosen.sync_steps:
+        if not isinstance(port.wire.board, TriggerLine):
+            raise ConfigError(f"sim.sync_steps: the board {chosen.board!r} has no sync line; sim.board=avr has")
+        table = {**table, "sync_steps": chosen.sync_steps}
     lens = controller(chosen.board).open_lens(table, world, port)
     if not lens.capabilities.stop_on_command:  # nor does such a controller remember where it is: as a person would
         here = Steps(round(mechanism.rotor_at(world.now_ns())))
@@ -395,7 +419,9 @@ def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
     )
 
 
-def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geometry) -> SimulatedCamera:
+def _camera(
+    chosen: SimSettings, world: World, light: LightField, geometry: Geometry, line: TriggerLine | None
+) -> SimulatedCamera:
     seed, width, height = chosen.seed, geometry.width, geometry.height
     sensor = EventSensor(
         width,
@@ -427,6 +453,7 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         mask_slots=MASK_SLOTS[chosen.camera],
         serial=f"simulated-{seed}",
         ring_packets=chosen.ring_packets,
+        trigger_line=line,
         rate_limit=RateLimit(chosen.rate_limit_mev_s, told=chosen.rate_limit_told),
         faults=CameraFaults(
             chosen.camera_vanishes_at_s, chosen.camera_silent_from_s, chosen.drop_from_s, chosen.drop_for_s
