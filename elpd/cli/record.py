@@ -11,9 +11,9 @@ from pathlib import Path
 
 import click
 
-from elpd.cli.common import config_options, from_here, interruptible, json_option, print_json
+from elpd.cli.common import config_options, interruptible, json_option, print_json
 from elpd.config import load
-from elpd.errors import UsageError
+from elpd.errors import BusyError, UsageError
 from elpd.ports import Identified
 from elpd.record.recorder import Ended, record
 from elpd.rig import camera_alone
@@ -43,7 +43,8 @@ def command(
     as_json: bool,
 ) -> int:
     """Record what the camera sees."""
-    from_here(foreground=foreground, config_path=config_path, overrides=overrides)
+    if not (foreground or config_path or overrides):
+        raise BusyError("name the camera: --config FILE, --set KEY=VALUE, or --foreground for the simulated one")
     if seconds is not None and not 0 < seconds < float("inf"):
         raise UsageError(f"--seconds must be positive; got {seconds}")
     config = load(config_path, overrides)
