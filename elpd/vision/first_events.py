@@ -30,6 +30,7 @@ from elpd.events.stream import PacketDecoder
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from elpd.events.registers import Integer
     from elpd.records import CameraPacket, Geometry
 
 SLOTS = 3
@@ -89,12 +90,13 @@ def latch_first_on(
     In two steps over some events: those that count are listed (pixel and time in the rows of *listed*) without a branch
     on their polarity, which nobody can predict, and their pixels asked for, which no near cache holds; then latched.
     """
-    n_on = n_before = n_after = n_outside = 0
+    n_on = n_before = n_after = 0
+    n_outside: Integer = 0
     room = listed.shape[1]
     begun = 0
     while begun < t_us.size:
         until = min(begun + room, t_us.size)
-        n = 0
+        n: Integer = 0
         for i in range(begun, until):
             is_on = np.int64(on[i] == 1)
             inside = np.int64(x[i] < width) & np.int64(y[i] < height)
