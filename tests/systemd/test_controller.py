@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from elpd.cli import COMMANDS
-
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Iterator
 
     from booted import Booted
 
-pytestmark = [
-    pytest.mark.xdist_group("systemd"),
-    pytest.mark.skipif("serve" not in COMMANDS, reason="there is no daemon in this version"),
-]
+pytestmark = pytest.mark.xdist_group("systemd")
 
 CONFIG = """
 rig = "hardware"
