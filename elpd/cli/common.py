@@ -40,7 +40,7 @@ def json_option(function: F) -> F:
 
 def print_json(answer: dict[str, Any]) -> None:
     """Print one object; NaN never leaves (``null`` does)."""
-    print(json.dumps(_plain(answer), allow_nan=False))
+    print(json.dumps(_plain(answer), allow_nan=False), flush=True)
 
 
 def report_error(kind: str, message: str, *, as_json: bool) -> None:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from elpd.record.session import Session
     from elpd.cli.view import View
+    from elpd.record.session import Session
     from elpd.records import ElpSample
 
 DEMO_RIG = ("sim.seed=7", "sim.scene=camera", "sim.start_um=-200", "sim.pace=1")
@@ -105,9 +105,9 @@ def run(config: Config, stream: TextIO | None) -> Demonstration:
     Raises ``UsageError`` if a part of the rig is not simulated, and what ``elpd.record.session.focus_on`` raises.
     """
     from elpd import rig  # noqa: PLC0415  (numba and the simulator only now)
-    from elpd.record.session import focus_on  # noqa: PLC0415
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
     from elpd.ports import Paced, Scenery  # noqa: PLC0415
+    from elpd.record.session import focus_on  # noqa: PLC0415
     from elpd.records import Roi  # noqa: PLC0415
 
     roi = None if config.focus.roi is None else Roi(*config.focus.roi)

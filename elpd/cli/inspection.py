@@ -192,9 +192,9 @@ def self_test(focus: Callable[[], dict[str, Any]]) -> Finding:
 
 def focus_simulated() -> dict[str, Any]:
     """Run one whole cycle on the default simulated rig, unrecorded."""
-    from elpd.record.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
     from elpd.config import Config  # noqa: PLC0415
     from elpd.focus.settings import FocusRequest  # noqa: PLC0415
+    from elpd.record.session import focus_once  # noqa: PLC0415  (numba and the simulator, only for the self-test)
 
     config = Config.model_validate({"rig": "sim", "journal": {"enabled": False}, "sim": {"pace": 0.0}})
     return focus_once(config, FocusRequest()).fields()

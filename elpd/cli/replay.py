@@ -40,7 +40,7 @@ def command(*, run: Path, config_path: Path | None, overrides: tuple[str, ...], 
     return 0 if report.identical else 1
 
 
-def run_cycle(parts: RigParts, run: RecordedRun, sink: RunSink, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+def run_cycle(parts: RigParts, run: RecordedRun, sink: RunSink, cancelled: Callable[[], int]) -> Mapping[str, Any]:
     """Build the cycle that *run* recorded from what is in its folder, and run it on *parts*."""
     from elpd.config import Config  # noqa: PLC0415
     from elpd.focus.cycle import FocusCycle, result_fields  # noqa: PLC0415

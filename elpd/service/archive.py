@@ -49,15 +49,15 @@ def run(directory: Path, name: str) -> RunAnswer:
     )
 
 
-def keep_budget(directory: Path, budget_bytes: float) -> int:
-    """Delete the oldest runs until all of ours fit; return how many went. The newest stays, whatever its size.
+def keep_budget(directory: Path, budget_bytes: float) -> None:
+    """Delete the oldest runs until all of ours fit. The newest stays, whatever its size.
 
     Runs that a person renamed are not ours, and neither counted nor deleted.
     """
     try:
-        folders = sorted((one for one in directory.iterdir() if _STAMPED.fullmatch(one.name) and is_run(one)))
+        folders = sorted(one for one in directory.iterdir() if _STAMPED.fullmatch(one.name) and is_run(one))
     except OSError:
-        return 0
+        return
     sizes = [sum(file.stat().st_size for file in one.rglob("*") if file.is_file()) for one in folders]
     total, gone = sum(sizes), 0
     for folder, size in zip(folders[:-1], sizes[:-1], strict=True):
@@ -67,7 +67,6 @@ def keep_budget(directory: Path, budget_bytes: float) -> int:
         total, gone = total - size, gone + 1
     if gone:
         log.info("old runs deleted", runs=gone, left_mb=total / 1e6, budget_mb=budget_bytes / 1e6)
-    return gone
 
 
 def _newest_first(directory: Path, limit: int) -> list[tuple[Path, dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""What the focus thread asks itself while it works: does somebody want this to end, did time jump, am I alive?
+"""What the focus thread asks itself while it works: does somebody want this to end, has time jumped.
 
 A process that was stopped, or a machine that slept, resumes in the middle of a sweep with seconds of the world unseen.
 The gap shows between two of these questions, which come every few milliseconds; what was being done ends then, with the

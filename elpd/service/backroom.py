@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import structlog
@@ -53,10 +54,8 @@ class Backroom:
 
     def also(self, work: Callable[[], None]) -> None:
         """Do *work* if there is room for it: something that whoever comes later would do as well."""
-        try:
+        with suppress(BusyError):
             self.do(work)
-        except BusyError:
-            log.debug("left out, too much waits")
 
     def close(self) -> None:
         """Finish what waits, then end."""
@@ -79,5 +78,5 @@ def answer_of(work: Callable[[], Result]) -> Answer:
     except OSError as error:
         return Answer(error=ErrorBody(kind="UsageError", message=f"{error.filename or 'disk'}: {error.strerror}"))
     except Exception as error:
-        log.exception("a request failed in a way that it should not")
+        log.exception("request failed")
         return Answer(error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log"))

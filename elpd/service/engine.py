@@ -13,7 +13,7 @@ import structlog
 
 from elpd import rig
 from elpd.calibrate.profile import state_directory
-from elpd.errors import FaultLatchedError, LensError, UnavailableError, UnreferencedError, UsageError
+from elpd.errors import FaultLatchedError, UnavailableError, UnreferencedError, UsageError
 from elpd.records import Cancel, StopMode
 from elpd.service import archive
 from elpd.service.attention import Attention
@@ -26,7 +26,6 @@ from elpd.service.job import Job, Place
 from elpd.service.keeper import RigKeeper
 from elpd.service.kept import Kept
 from elpd.service.lease import Lease
-from elpd.service.metrics import exposition
 from elpd.service.messages import (
     CancelAnswer,
     ClearAnswer,
@@ -36,6 +35,7 @@ from elpd.service.messages import (
     StopAnswer,
     operates,
 )
+from elpd.service.metrics import exposition
 from elpd.service.pictures import Album
 from elpd.service.situation import Situation
 from elpd.service.work import Work
@@ -56,6 +56,9 @@ FOCUS_LOOP = "focus"
 
 DEVICE_METHODS = frozenset({"focus", "home", "move", "jog", "record"})
 """Methods that need the focus thread; so does ``preset`` where it moves the lens."""
+
+RIG_SECTIONS = ("rig", "camera", "lens", "aperture", "sim", "state")
+"""What a rig is made of: another one of these is another rig."""
 
 WITHOUT_REFERENCE = frozenset({"home", "record"})
 """What a lens that does not know where it is may be asked for."""
@@ -101,11 +104,12 @@ class RigEngine:
         attention = Attention(self.heartbeats, FOCUS_LOOP)
         work = Work(self.situation, attention, self._kept)
         self.autopilot = Autopilot(config, self.situation, self._kept, self.lease, self.place, time)
+        work.focused_at = self.autopilot.focused_at
         self._clerk = Clerk(self.situation, self._kept, self.lease, self.autopilot)
         self._work = work
-        self._idle = Idle(self.situation, time, config.service, self._hear)
+        self.idle = Idle(self.situation, time, config.service, self._hear)
         self.worker = Worker(
-            self.keeper, self.place, self._idle, work, self.autopilot, self.situation, attention, time, self._ended
+            self.keeper, self.place, self.idle, work, self.autopilot, self.situation, attention, time, self._ended
         )
         self._remember()
 
@@ -158,7 +162,7 @@ class RigEngine:
         return self.situation.listen(listener)
 
     def gone(self, caller: Caller) -> None:
-        """A connection has ended."""
+        """Hear that a connection has ended."""
         self.lease.gone(caller)
         for job in self.place.jobs():
             params = job.request.params
@@ -169,7 +173,7 @@ class RigEngine:
                 job.cancel()
 
     def beat(self, loop: str) -> None:
-        """A loop outside lives."""
+        """Hear that a loop outside lives."""
         self.heartbeats.beat(loop)
 
     def note_clients(self, counts: ClientCounts) -> None:
@@ -190,16 +194,22 @@ class RigEngine:
         self._save()
         self.situation.began()
 
-    def reload(self, config: Config) -> None:
-        """Take another configuration, as soon as nothing is being done."""
+    def reload(self, config: Config, done: Callable[[], None] = lambda: None) -> None:
+        """Take another configuration, as soon as nothing is being done; *done* is called then.
+
+        The rig is opened anew only if what it is made of has changed. State, once read, stays where it was.
+        """
 
         def change() -> None:
+            other = any(getattr(config, part) != getattr(self.config, part) for part in RIG_SECTIONS)
             self.config = self.keeper.config = config
-            self.situation.configured(config)
-            self._idle.reconfigure(config.service)
+            self.idle.reconfigure(config.service)
             self.autopilot.reconfigure(config)
-            self.worker.reopen()
-            log.info("configuration reloaded")
+            if other:
+                self.worker.reopen()
+                self.situation.configured(config)
+            log.info("configuration reloaded", rig_reopened=other)
+            done()
 
         self.worker.reload = change
         self.place.ring()
@@ -290,7 +300,7 @@ class RigEngine:
             self.album.keep_frame(packet.frames[-1], position_um)
         if parts is not None:
             self.album.keep_events(events, parts.camera.geometry, position_um)
-            self.autopilot.hear(packet, events)
+            self.autopilot.hear(events)
 
     def _remember(self) -> None:
         """Begin with what was kept."""
@@ -301,7 +311,7 @@ class RigEngine:
             self.situation.warn("state-damaged", self._kept.complaint)
             log.warning("state damaged", reason=self._kept.complaint)
         if kept.open:
-            log.warning("the daemon before ended badly; the lens must be homed")
+            log.warning("daemon ended badly before")
 
     def _save(self) -> None:
         try:

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 READ_TIMEOUT_S = 0.01
 """One turn of listening; a request waits no longer than this for its turn."""
 
+POLL_TURN_S = 0.002
+FIRST_REPORT_S = 1.0
+"""A controller that has just been identified tells where it is within this time."""
+
 SILENCE_S = 1.0
 """While nothing moves a camera may say nothing for so long before it counts as lost."""
 
@@ -86,6 +90,15 @@ class Idle:
         self._situation.update_lens(
             connected=True, limits_um=(parts.scale.to_um(limits.min_steps), parts.scale.to_um(limits.max_steps))
         )
+
+    def meet(self, parts: RigParts, *, needs_home: bool) -> None:
+        """Hear once where the lens is, before requests are taken. Raises ``LensError`` if it does not say."""
+        until_s = self._time.now_s() + FIRST_REPORT_S
+        while (report := parts.lens.poll()) is None:
+            if self._time.now_s() > until_s:
+                raise LensError(f"lens: no report within {FIRST_REPORT_S:g} s of connecting; check its cable")
+            self._time.nap(POLL_TURN_S)
+        self.tell_lens(parts, report, needs_home=needs_home)
 
     def turn(self, parts: RigParts, *, needs_home: bool) -> None:
         """Do one turn: a few milliseconds of listening or napping, the lens asked once.

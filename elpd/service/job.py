@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import BusyError
 from elpd.records import Cancel
-from elpd.service.engine_port import Answer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from elpd.service.engine_port import Request
+    from elpd.service.engine_port import Answer, Request
 
 
 class Job:

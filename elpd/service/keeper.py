@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from elpd import rig
 from elpd.errors import BusyError, DeviceError, LensError
-from elpd.records import StopMode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.config import Config
     from elpd.ports import Lens, RigParts
+    from elpd.records import StopMode
 
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0

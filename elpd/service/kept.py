@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from elpd.errors import UsageError
 from elpd.service import store
-from elpd.service.messages import ModeName, Preset, RoiBox
+from elpd.service.messages import ModeName, Preset, RoiBox  # noqa: TC001  (pydantic asks for them at run time)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,7 +85,9 @@ class Kept:
         """Return one. Raises ``UsageError`` with the names there are."""
         found = self._content.presets.get(name)
         if found is None:
-            raise UsageError(f"there is no preset {name!r}; there are: {', '.join(sorted(self._content.presets)) or 'none'}")
+            raise UsageError(
+                f"there is no preset {name!r}; there are: {', '.join(sorted(self._content.presets)) or 'none'}"
+            )
         return found
 
     def save_preset(self, preset: Preset) -> None:
@@ -107,7 +109,9 @@ class Kept:
     def delete_roi(self, name: str) -> None:
         """Forget a region. Raises ``UsageError`` if there is none of that name."""
         if name not in self._content.named:
-            raise UsageError(f"there is no region {name!r}; there are: {', '.join(sorted(self._content.named)) or 'none'}")
+            raise UsageError(
+                f"there is no region {name!r}; there are: {', '.join(sorted(self._content.named)) or 'none'}"
+            )
         self.change(named={key: value for key, value in self._content.named.items() if key != name})
 
     def change(self, **changes: Any) -> None:

@@ -140,19 +140,19 @@ class Situation:
     # --- writing -----------------------------------------------------------------------------------------------------
 
     def began(self) -> None:
-        """Everything is open and compiled."""
+        """Say that everything is open and compiled."""
         with self._lock:
             self._ready = True
         self._tell_state()
 
     def stopping(self) -> None:
-        """The daemon is going down."""
+        """Say that the daemon is going down."""
         with self._lock:
             self._stopping = True
         self._tell_state()
 
     def focusing(self, *, on: bool) -> None:
-        """A cycle begins or has ended."""
+        """Say whether a cycle is under way."""
         with self._lock:
             self._focusing = on
         self._tell_state()
@@ -164,7 +164,7 @@ class Situation:
         self._tell_state()
 
     def set_phase(self, phase: str | None) -> None:
-        """What is being done."""
+        """Say what is being done."""
         with self._lock:
             self._phase = phase
 
@@ -216,7 +216,7 @@ class Situation:
             self._camera = camera.model_copy(update={"events": camera.events + events, "lost": camera.lost + lost})
 
     def ended(self, last: FocusAnswer) -> None:
-        """A cycle has ended."""
+        """Count and tell the end of a cycle."""
         with self._lock:
             self._last = last
             counters = self._counters
@@ -244,7 +244,7 @@ class Situation:
             self._warnings[code] = Warned(code=code, text=text)
 
     def unwarn(self, code: str) -> None:
-        """It is odd no more."""
+        """Take a warning back."""
         with self._lock:
             self._warnings.pop(code, None)
 

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from elpd.errors import ConfigError, DeviceError, FormatError, LensError, UnavailableError, UnreferencedError, UsageError
+from elpd.errors import (
+    ConfigError,
+    DeviceError,
+    FormatError,
+    LensError,
+    UnavailableError,
+    UnreferencedError,
+    UsageError,
+)
 from elpd.records import Outcome, StopMode
 from elpd.service.attention import PAUSE_S
 from elpd.service.engine_port import Answer
@@ -89,6 +97,7 @@ class Worker:
         if job is not None:
             self._run(job, parts)
             return
+        self._idle.every_s = self._autopilot.listen_every_s
         try:
             self._idle.turn(parts, needs_home=self._keeper.needs_home)
         except DeviceError as error:
@@ -138,11 +147,16 @@ class Worker:
                 parts = self._keeper.open(now_s)
         except (DeviceError, ConfigError, FormatError) as error:
             if self._situation.latch(error.kind, str(error)):
-                log.error("fault latched", kind=error.kind, reason=str(error))
+                log.error("fault latched", kind=error.kind, reason=str(error), lens=None)  # noqa: TRY400  (said, not traced)
             return
         self._time.follow(parts.clock)
         self._attention.follow(parts.clock)
         self._idle.opened(parts)
+        try:
+            self._idle.meet(parts, needs_home=self._keeper.needs_home and parts.lens.capabilities.homing)
+        except LensError as error:
+            self.lost(error)
+            return
         self._autopilot.opened()
         homes = parts.lens.capabilities.homing
         if self._keeper.needs_home and not homes:
@@ -161,8 +175,8 @@ class Worker:
         self._attention.follow(None)
 
     def _after_pause(self, passed_s: float) -> None:
-        """A machine that slept: what was known of the scene is old, and the lens is asked anew before anything moves."""
-        log.warning("the process stood still", seconds=passed_s)
+        """Forget the scene: the machine slept. The lens is asked anew before anything moves."""
+        log.warning("process stood still", seconds=passed_s)
         self._situation.warn("paused", f"this process stood still for {passed_s:.1f} s while nothing moved")
         self._autopilot.forget()
 
@@ -193,12 +207,16 @@ class Worker:
             self.lost(error)
             return Answer.failed(error)
         except Exception as error:
-            log.exception("a request failed in a way that it should not")
+            log.exception("request failed")
             self.lost(error)
-            return Answer(error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log"))
+            return Answer(
+                error=ErrorBody(kind="InternalError", message=f"{type(error).__name__}: {error}; see the log")
+            )
         self._attention.beat()
+        self._situation.update_lens(moving=False)
         if job.request.method == "home":
             self._keeper.needs_home = False
+            self._situation.update_lens(referenced=True)
         try:
             self._idle.tell_lens(parts, parts.lens.poll(), needs_home=self._keeper.needs_home)
         except DeviceError as error:
@@ -221,8 +239,6 @@ def _cancelled_before(job: Job) -> Answer:
     why = job.why_cancelled or "cancelled on request, before anything moved"
     if not isinstance(job.request.params, FocusParams):
         return Answer(error=ErrorBody(kind="Cancelled", message=why))
-    fields = {name: None for name in ("focus_um", "sigma_um", "stop_um", "final_um", "stop_latency_us")}
+    fields = dict.fromkeys(("focus_um", "sigma_um", "stop_um", "final_um", "stop_latency_us"))
     counted = {"reversals": 0, "duration_ms": 0.0, "phases": [], "events": 0, "lost": 0}
     return Answer(FocusAnswer.model_validate({"outcome": Outcome.CANCELLED.value, "reason": why, **fields, **counted}))
-
-

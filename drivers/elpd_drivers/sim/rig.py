@@ -26,13 +26,14 @@ from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
+from elpd_drivers.sim.drift import Drift
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from elpd_drivers.sim.motion import SceneMotion
 from elpd_drivers.sim.optics import LAMP_SHAPES, DefocusStack, Lamp, Layer, LightField
 from elpd_drivers.sim.retina import OVEREXPOSED, ApsFrames, Retina
 from elpd_drivers.sim.scene import choose_scene, scene_canvas
 from elpd_drivers.sim.sensor import FOCUS, HOT_PIXEL_HZ, LAG_US_AT_FULL, MISMATCH_SD, BiasLevels, EventSensor
-from elpd_drivers.sim.world import World, random_stream
+from elpd_drivers.sim.world import BIRTH_NS, World, random_stream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +65,7 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in.
+    believes in. Focus moves along the travel by ``drift_um_s``.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -122,6 +123,7 @@ class SimSettings:
     um_per_step: float = 0.3125
     steps_to_um: tuple[tuple[float, float], ...] = ()
     cam: float = 0.0
+    drift_um_s: float = 0.0
     backlash_um: float = 4.0
     acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
@@ -170,6 +172,8 @@ class SimulatedTruth:
     ----------
     focus_carriage_um
         The carriage position of true focus, from the lower end stop.
+    drift
+        How far focus has moved since; tests move it.
     """
 
     def __init__(
@@ -186,6 +190,7 @@ class SimulatedTruth:
         geometry: Geometry,
         cam: Cam,
         scale: LensScale,
+        drift: Drift,
     ) -> None:
         self.world = world
         self.mechanism = mechanism
@@ -193,6 +198,7 @@ class SimulatedTruth:
         self.aperture = aperture
         self.focus_carriage_um = focus_carriage_um
         self.scene = scene
+        self.drift = drift
         self._lens = lens
         self._light = light
         self._geometry = geometry
@@ -213,7 +219,7 @@ class SimulatedTruth:
             self._cam.image_um(self.mechanism.carriage_um(now)),
             self._cam.image_um(np.float64(self.focus_carriage_um)),
         )
-        return float(here_um[0] - focus_um)
+        return float(here_um[0] - focus_um - self.drift.um(now)[0])
 
     def focus_um(self, sweep_sign: int) -> float | None:
         """Return focus on the motor's ruler while the carriage is pushed in a direction (+1, -1; 0: mid-play).
@@ -227,7 +233,8 @@ class SimulatedTruth:
         except LensError:
             return None
         mechanics = self.mechanism.mechanics
-        rotor_um = self.focus_carriage_um + sweep_sign * mechanics.backlash_um / 2
+        drift_um = float(self.drift.um(np.array([now], np.int64))[0])  # without a cam the two rulers are one
+        rotor_um = self.focus_carriage_um + drift_um + sweep_sign * mechanics.backlash_um / 2
         shift = round(count - self.mechanism.rotor_at(now))
         return self._scale.to_um(rotor_um / mechanics.um_per_step + shift)
 
@@ -259,6 +266,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     world = World(chosen.pace)
     focus_um, start_um = _place(chosen)
     mechanism = SimulatedLens(_mechanics(chosen), start_um=start_um)
+    drift = Drift(BIRTH_NS, chosen.drift_um_s)
     lens, port = _lens(chosen, world, mechanism)
     aperture = _aperture(chosen, world) if chosen.camera == "evk4" else None
     scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
@@ -267,7 +275,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     pan_px_s = (float(chosen.pan_px_s * np.cos(heading)), float(chosen.pan_px_s * np.sin(heading)))
     light = LightField(
         stack,
-        lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)),
+        lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)) - drift.um(times_ns),
         float(cam.image_um(np.float64(focus_um))),
         SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX, pan_px_s),
         aperture=aperture,
@@ -290,6 +298,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         geometry=geometry,
         cam=cam,
         scale=scale,
+        drift=drift,
     )
     return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, scale, truth)
 
@@ -326,6 +335,8 @@ def _geometry(chosen: SimSettings) -> Geometry:
             f"sim.lag_us is {chosen.lag_us:g} and must be more than 0; sim.mismatch is {chosen.mismatch:g} and must "
             f"lie in 0 to {LARGEST_MISMATCH:g}, or some pixels would have no threshold"
         )
+    if chosen.drift_um_s and chosen.cam:
+        raise ConfigError("sim.drift_um_s and sim.cam do not go together: the truth would not know where focus is")
     if chosen.depth_of_focus_um <= 0 or chosen.brightness <= 0:
         raise ConfigError("sim.depth_of_focus_um and sim.brightness must be more than 0; use sim.cap for darkness")
     if chosen.flicker_shape not in LAMP_SHAPES or not 0 <= chosen.flicker_depth <= 1:

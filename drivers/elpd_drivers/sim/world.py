@@ -74,6 +74,13 @@ class World:
         if self._pace > 0:
             self._keep_pace()
 
+    def leap_to(self, when: HostNs) -> None:
+        """Let time pass in one step, for hours in which nobody listens; what is under way arrives at its end."""
+        if when > self._now:
+            self._now = when
+            for actor in self._actors:
+                actor.advance_to(when)
+
     @property
     def lag_s(self) -> float:
         """How far the paced world is behind the wall clock, in wall seconds; negative if ahead; 0 without a pace."""

@@ -84,16 +84,18 @@ class Wire:
         self._to_board: deque[tuple[int, int]] = deque()
         self._to_host: deque[tuple[int, int]] = deque()
         self._out_free_ns = self._in_free_ns = 0
+        self._sending = threading.Lock()
         self._kept: list[int] = []
         self._kept_until_ns = 0
 
     def send(self, data: bytes, at_ns: int) -> None:
         """Let the host write at *at_ns*; the bytes follow those already in flight."""
-        free = max(self._out_free_ns, at_ns + self._latency_ns)
-        for byte in data:
-            free += self.board.byte_ns
-            self._to_board.append((free, byte))
-        self._out_free_ns = free
+        with self._sending:  # a stop from another thread comes between two commands, never inside one
+            free = max(self._out_free_ns, at_ns + self._latency_ns)
+            for byte in data:
+                free += self.board.byte_ns
+                self._to_board.append((free, byte))
+            self._out_free_ns = free
 
     def advance_to(self, when_ns: int) -> None:
         """Deliver what arrives at the board by *when_ns*, and let the board live until then."""

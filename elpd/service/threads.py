@@ -1,0 +1,131 @@
+"""The engine's threads: one that focuses, one that watches over it.
+
+The focus thread turns until the end. The supervisor owns no device: when the focus thread gives no sign of life it
+sends the lens the strongest stop, and it feeds the watchdog only while every loop lives, so that a process that hangs
+is ended and begun again from outside.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import structlog
+
+from elpd.records import Cancel, StopMode
+from elpd.service.engine import FOCUS_LOOP
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from elpd.service.engine import RigEngine
+    from elpd.service.notify import Notifier
+
+FOCUS_LIMIT_S = 1.0
+"""The focus thread beats every few milliseconds; silent for so long it hangs."""
+
+API_LOOP = "api"
+API_LIMIT_S = 1.5
+"""The socket's loop beats four times a second."""
+
+LOOK_EVERY_S = 0.1
+"""How often the supervisor looks."""
+
+END_S = 5.0
+"""How long the lens may take to come to rest at the end, and the journal to be written."""
+
+log = structlog.get_logger(__name__)
+
+
+class EngineThreads:
+    """Runs an engine against the wall clock.
+
+    Parameters
+    ----------
+    engine
+        Built with ``threaded=True``.
+    notifier
+        Who hears that all is well.
+    prepare
+        Called first on the focus thread, for its scheduling.
+    """
+
+    def __init__(self, engine: RigEngine, notifier: Notifier, prepare: Callable[[], None] = lambda: None) -> None:
+        self._engine = engine
+        self._notifier = notifier
+        self._prepare = prepare
+        self._watch = Supervisor(engine, notifier)
+        self._ready = threading.Event()
+        self._end = threading.Event()
+        self._focus = threading.Thread(target=self._run, name="elpd-focus", daemon=True)
+        self._supervisor = threading.Thread(target=self._supervise, name="elpd-supervisor", daemon=True)
+
+    def start(self) -> None:
+        """Begin; returns once the rig was tried and requests are taken."""
+        self._focus.start()
+        self._ready.wait()
+        self._engine.heartbeats.expect(FOCUS_LOOP, FOCUS_LIMIT_S)
+        self._supervisor.start()
+
+    def stop(self) -> bool:
+        """Stop the lens, end what runs, give the rig back. ``False`` if the focus thread did not end in time."""
+        self._engine.begin_stopping()
+        self._end.set()
+        self._focus.join(END_S)
+        ended = not self._focus.is_alive()
+        if not ended:
+            self._engine.keeper.stop_lens(StopMode.ABRUPT)
+            log.error("focus thread did not end", limit_s=END_S)
+        if self._supervisor.is_alive():
+            self._supervisor.join(END_S)
+        return ended
+
+    def _run(self) -> None:
+        self._prepare()
+        self._turn()
+        self._engine.ready()
+        self._ready.set()
+        while not self._end.is_set():
+            self._turn()
+        self._engine.heartbeats.forget(FOCUS_LOOP)
+        self._engine.finish_stopping()
+
+    def _turn(self) -> None:
+        try:
+            self._engine.step()
+        except Exception as error:
+            log.exception("focus thread failed")
+            self._engine.worker.lost(error)
+
+    def _supervise(self) -> None:
+        pause_s = min(LOOK_EVERY_S, self._notifier.watchdog_s / 4 or LOOK_EVERY_S)
+        while not self._end.wait(pause_s):
+            self._watch.look()
+
+
+class Supervisor:
+    """Looks whether every loop lives; stops the lens of a focus thread that does not, once."""
+
+    def __init__(self, engine: RigEngine, notifier: Notifier) -> None:
+        self._engine = engine
+        self._notifier = notifier
+        self._stopped = False
+
+    def look(self) -> None:
+        """Look once."""
+        late = self._engine.heartbeats.late()
+        if FOCUS_LOOP in late and not self._stopped:
+            self._stop_for(late[FOCUS_LOOP])
+        self._stopped = FOCUS_LOOP in late
+        if not late:
+            self._notifier.alive()
+
+    def _stop_for(self, silent_s: float) -> None:
+        """Stop the lens of a focus thread that hangs: the bytes first."""
+        failure = self._engine.keeper.stop_lens(StopMode.ABRUPT)
+        why = f"the focus thread was silent for {silent_s:.1f} s (limit {FOCUS_LIMIT_S:g}); the lens was stopped"
+        if failure is not None:
+            why = f"{why}, or should have been: {failure}"
+        log.error("focus thread hangs", silent_s=silent_s, limit_s=FOCUS_LIMIT_S)
+        self._engine.place.cancel_all(Cancel.HOLD, why)
+        self._engine.situation.latch("Hang", f"{why}; see the log for where it hung, then clear")

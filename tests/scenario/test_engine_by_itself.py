@@ -1,0 +1,187 @@
+"""What the daemon does by itself: focuses when sharpness was lost, follows a temperature, gives way to everybody."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from engines import SOMEBODY, Daemon
+
+from elpd.service.threads import FOCUS_LIMIT_S, Supervisor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+KNOCK_UM = 60.0
+TABLE = "temperature.table=[[0.0, 0.0], [40.0, -80.0]]"
+
+
+@pytest.fixture
+def watching(tmp_path: Path) -> Daemon:
+    """A daemon in continuous mode that has focused."""
+    daemon = Daemon(tmp_path, "journal.enabled=false").begin()
+    daemon.do("mode", mode="continuous")
+    daemon.until(lambda: daemon.status.counters.focused == 1)
+    return daemon
+
+
+def knock(daemon: Daemon, by_um: float = KNOCK_UM) -> None:
+    daemon.truth.drift.shift(daemon.truth.world.now_ns(), by_um, 50.0)
+
+
+def test_a_scene_that_stays_sharp_is_left_alone(watching: Daemon) -> None:
+    steps = watching.steps
+    watching.run(8.0)
+    assert watching.status.counters.focused == 1
+    assert watching.steps == steps
+
+
+def test_a_knock_is_focused_away_after_the_hold_off(watching: Daemon) -> None:
+    watching.run(2.5)
+    knock(watching)
+    assert abs(watching.truth.carriage_error_um()) < 6.0 or watching.run(0.1) is None
+    watching.until(lambda: watching.status.counters.focused == 2, 5.0)
+    assert abs(watching.truth.carriage_error_um()) < 6.0
+    assert watching.do("mode").hold["loss"] == 0.0
+
+
+def test_two_knocks_at_once_wait_for_the_hold_off(watching: Daemon) -> None:
+    watching.run(0.5)
+    knock(watching)
+    watching.run(1.0)
+    assert watching.status.counters.focused == 1
+    assert watching.do("mode").hold["waits_for"] == "the end of the hold-off"
+    watching.until(lambda: watching.status.counters.focused == 2, 3.0)
+
+
+def test_nothing_moves_by_itself_while_somebody_holds_the_lease(watching: Daemon) -> None:
+    watching.run(2.5)
+    watching.do("lease", action="acquire", seconds=3.0, by=SOMEBODY)
+    knock(watching)
+    steps = watching.steps
+    watching.run(2.5)
+    assert watching.steps == steps
+    assert watching.do("mode").hold["defocused"] is True
+    watching.until(lambda: watching.status.counters.focused == 2, 3.0)
+
+
+def test_a_place_that_somebody_chose_is_kept(watching: Daemon) -> None:
+    watching.run(2.5)
+    watching.do("move", fraction=0.2)
+    knock(watching)
+    steps = watching.steps
+    watching.run(4.0)
+    assert watching.steps == steps
+    assert "moved the lens" in watching.do("mode").hold["waits_for"]
+
+
+def test_after_a_stop_it_waits_to_be_asked(watching: Daemon) -> None:
+    watching.run(2.5)
+    knock(watching)
+    watching.at_phase("sweep", 5.0, watching.engine.stop)
+    watching.until(lambda: watching.status.counters.cancelled == 1, 5.0)
+    steps = watching.steps
+    watching.run(4.0)
+    assert watching.steps == steps
+    watching.do("mode", mode="continuous")
+    watching.until(lambda: watching.status.counters.focused == 2, 5.0)
+
+
+def test_somebodys_request_ends_its_own_cycle_and_comes_first(watching: Daemon) -> None:
+    watching.run(2.5)
+    knock(watching)
+    asked = []
+    watching.at_phase("sweep", 5.0, lambda: asked.append(watching.ask("move", fraction=0.9)))
+    watching.until(lambda: bool(asked), 5.0)
+    assert watching.until_answered(asked[0]).result.outcome == "OK"
+    assert watching.steps * watching.parts.um_per_step == pytest.approx(2250.0, abs=1.0)
+
+
+def test_a_scene_without_texture_is_given_up_on(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, "sim.scene=flat", "journal.enabled=false", "modes.hold_off_s=0.01").begin()
+    daemon.do("mode", mode="continuous")
+    daemon.run(10.0)
+    assert sum(daemon.status.counters.not_focused.values()) == 7
+    assert "after 7 cycles" in daemon.do("mode").hold["waits_for"]
+
+
+def test_a_schedule_checks_again(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, "journal.enabled=false").begin()
+    daemon.do("mode", mode="scheduled", period_s=5.0)
+    daemon.run(16.5)
+    assert daemon.status.counters.focused == 3
+
+
+def test_a_temperature_moves_the_lens_by_the_table_and_no_further_than_allowed(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, TABLE, "temperature.max_step_um=20", "journal.enabled=false").begin()
+    assert daemon.do("temperature", celsius=20.0).offset_um is None, "nothing was focused yet"
+    focus_um = daemon.do("focus").final_um
+    daemon.run(1.0)
+    assert daemon.status.lens.position_um == pytest.approx(focus_um, abs=0.4)
+    assert daemon.do("temperature", celsius=25.0).offset_um == pytest.approx(-10.0)
+    daemon.run(1.0)
+    assert daemon.status.lens.position_um == pytest.approx(focus_um - 10.0, abs=0.4)
+    assert daemon.do("temperature", celsius=26.0).offset_um == pytest.approx(-12.0)
+    daemon.run(1.0)
+    assert daemon.status.lens.position_um == pytest.approx(focus_um - 10.0, abs=0.4), "2 um are not worth a move"
+    daemon.do("temperature", celsius=35.0)
+    places = [event.position_um for event in daemon.told("position") if event.moving is False]
+    daemon.run(2.0)
+    assert daemon.status.lens.position_um == pytest.approx(focus_um - 30.0, abs=0.4)
+    assert places
+
+
+def test_a_temperature_moves_nothing_while_focusing_held_or_in_manual_mode(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, TABLE, "journal.enabled=false").begin()
+    daemon.do("temperature", celsius=20.0)
+    daemon.do("focus")
+    daemon.at_phase("sweep", 5.0, lambda: daemon.ask("temperature", celsius=30.0))
+    result = daemon.do("focus")
+    assert abs(result.truth["final_error_um"]) < 6.0, "the cycle went its own way"
+    daemon.do("lease", action="acquire", seconds=5.0)
+    steps = daemon.steps
+    daemon.do("temperature", celsius=20.0)
+    daemon.run(1.0)
+    assert daemon.steps == steps
+    daemon.do("lease", action="release")
+    daemon.do("mode", mode="manual")
+    daemon.run(1.0)
+    assert daemon.steps == steps
+    daemon.do("mode", mode="one-shot")
+    daemon.run(1.0)
+    assert daemon.steps != steps
+
+
+def test_a_focus_thread_that_hangs_has_its_lens_stopped_and_no_watchdog_fed(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path).begin()
+    clock = [100.0]
+    beats = daemon.engine.heartbeats
+    beats._now_s = lambda: clock[0]
+    beats.expect("focus", FOCUS_LIMIT_S)
+    notifier = FakeNotifier()
+    supervisor = Supervisor(daemon.engine, notifier)  # type: ignore[arg-type]
+    supervisor.look()
+    assert notifier.fed == 1
+    daemon.parts.lens.run(2000.0, daemon.truth.world.now_ns() + 2_000_000_000)
+    daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 20_000_000)
+    assert daemon.velocity != 0.0
+    clock[0] += FOCUS_LIMIT_S + 0.1
+    supervisor.look()
+    supervisor.look()
+    daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 10_000_000)
+    assert daemon.velocity == 0.0
+    assert notifier.fed == 1
+    assert daemon.status.fault is not None
+    assert daemon.status.fault.kind == "Hang"
+    assert daemon.status.counters.faults == 1
+    beats.beat("focus")
+    supervisor.look()
+    assert notifier.fed == 2
+
+
+class FakeNotifier:
+    fed = 0
+
+    def alive(self) -> None:
+        self.fed += 1
