@@ -32,6 +32,7 @@ COMMANDS = {
     "jog": "move the lens by so much",
     "move": "move the lens to a place",
     "park": "stop the lens past any daemon: the last resort",
+    "report": "a recorded run as one HTML page",
     "replay": "run a recorded cycle again, to the same decision",
     "serve": "the daemon: own the rig, answer on a socket",
     "sim-board": "a simulated lens controller on a pty",
