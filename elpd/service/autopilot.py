@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from elpd.focus.settings import CycleSettings
 from elpd.records import Roi
@@ -153,10 +153,15 @@ class Autopilot:
             if self._evidence is not None:
                 self._evidence.hear(events, self._time.now_s())
 
-    def arrived_from(self, position_um: float) -> Any:
+    def arrived_from(self, position_um: float) -> Literal[-1, 0, 1]:
         """Return from which side the lens came to where it is: -1, +1, or 0 where that is not known."""
+        sign = self.focused_at(position_um) or 0
+        return 1 if sign > 0 else -1 if sign < 0 else 0
+
+    def focused_at(self, position_um: float) -> int | None:
+        """Say whether the lens, being at a place, was put there by focusing: the sign of its last motion, else None."""
         near = self._at_focus_um is not None and abs(position_um - self._at_focus_um) <= NEAR_UM
-        return self._sign if near else 0
+        return self._sign if near else None
 
     def job(self) -> Job | None:
         """Return what should be done by itself now, already begun; mostly nothing."""
@@ -187,7 +192,8 @@ class Autopilot:
         self._since_s = self._time.now_s()
         before_um = self._at_focus_um
         if result.outcome != "FOCUSED":
-            self._at_focus_um = None
+            back = result.final_um is not None and self.focused_at(result.final_um) is not None
+            self._at_focus_um = before_um if back else None
             if result.outcome != "CANCELLED":
                 self._failures, self._strikes = self._failures + 1, self._strikes + 1
             return

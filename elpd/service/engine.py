@@ -104,11 +104,12 @@ class RigEngine:
         attention = Attention(self.heartbeats, FOCUS_LOOP)
         work = Work(self.situation, attention, self._kept)
         self.autopilot = Autopilot(config, self.situation, self._kept, self.lease, self.place, time)
+        work.focused_at = self.autopilot.focused_at
         self._clerk = Clerk(self.situation, self._kept, self.lease, self.autopilot)
         self._work = work
-        self._idle = Idle(self.situation, time, config.service, self._hear)
+        self.idle = Idle(self.situation, time, config.service, self._hear)
         self.worker = Worker(
-            self.keeper, self.place, self._idle, work, self.autopilot, self.situation, attention, time, self._ended
+            self.keeper, self.place, self.idle, work, self.autopilot, self.situation, attention, time, self._ended
         )
         self._remember()
 
@@ -202,7 +203,7 @@ class RigEngine:
         def change() -> None:
             other = any(getattr(config, part) != getattr(self.config, part) for part in RIG_SECTIONS)
             self.config = self.keeper.config = config
-            self._idle.reconfigure(config.service)
+            self.idle.reconfigure(config.service)
             self.autopilot.reconfigure(config)
             if other:
                 self.worker.reopen()

@@ -1,4 +1,4 @@
-"""What the daemon does by itself: focuses again when sharpness was lost, follows a temperature, gives way to everybody."""
+"""What the daemon does by itself: focuses when sharpness was lost, follows a temperature, gives way to everybody."""
 
 from __future__ import annotations
 
