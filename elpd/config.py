@@ -125,7 +125,7 @@ class ApiSection(_Section):
     socket: Path | None = None
     """``/run/elpd/elpd.sock`` where that folder can be written, else ``$XDG_RUNTIME_DIR/elpd/elpd.sock``."""
     operators: str | None = None
-    """A group whose members may operate the rig, beside root and the daemon's own user; all others look."""
+    """A group whose members may operate, beside root and the daemon's own user; whoever else gets in may look."""
 
 
 class ModesSection(_Section):

@@ -12,7 +12,6 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
-from elpd.calibrate.aperture import with_profile
 from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.lens import teach
 from elpd.errors import ConfigError, DeviceError
@@ -79,6 +78,8 @@ def build(config: Config) -> RigParts:
     teach(parts.lens, config)
     if not parts.lens.capabilities.stop_on_command:
         parts = replace(parts, lens=_in_moves(parts, config))
+    from elpd.calibrate.aperture import with_profile  # noqa: PLC0415  (brings numba: a lens alone is stopped without)
+
     return replace(parts, aperture=with_profile(config, parts.aperture))
 
 
@@ -107,6 +108,30 @@ def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
     finally:
         if isinstance(lens, Closeable):
             lens.close()
+
+
+@contextmanager
+def camera_alone(config: Config) -> Iterator[tuple[Clock, EventCamera]]:
+    """Open the camera that *config* describes, without a lens, and give it back at the end. Nothing can move.
+
+    The simulated camera comes with its world, whose lens stands still. Raises what ``build`` raises.
+    """
+    if config.rig == "sim" and config.camera.driver == "sim":
+        parts = build(config)
+        try:
+            yield parts.clock, parts.camera
+        finally:
+            release(parts)
+        return
+    if config.camera.driver == "sim":
+        raise ConfigError('camera.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    clock = MonotonicClock()
+    camera = _open("elpd.cameras", config.camera, clock)
+    try:
+        yield clock, camera
+    finally:
+        if isinstance(camera, Closeable):
+            camera.close()
 
 
 def release(parts: RigParts) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from elpd.errors import BusyError
 from elpd.service.engine_port import Answer, Caller, ClientCounts, Request
@@ -18,6 +18,7 @@ from elpd.service.messages import (
     LensStatus,
     MetricsAnswer,
     MoveAnswer,
+    Params,
     Status,
     StopAnswer,
 )
@@ -67,19 +68,25 @@ class FakeEngine:
         self.calls: list[str] = []
         self.requests: list[Request] = []
         self.accepted: list[FakeTicket] = []
+        self.waiting: list[FakeTicket] = []
         self.departed: list[Caller] = []
+        self.changes: dict[str, Any] = {}
+        """What the status says otherwise than usual."""
+        self.patient = False
+        """Whether to answer nothing before the test says so."""
         self.beats = 0
         self.counts = ClientCounts()
         self.listeners: list[Callable[[Event], None]] = []
         self._changed = threading.Condition()
 
     def status(self) -> Status:
-        return Status(
+        status = Status(
             state="READY", mode="one-shot", phase=None, fault=None, lens=LensStatus(driver="fake"),
             camera=CameraStatus(driver="fake"), aperture=None, roi=None, lease=LeaseAnswer(holder=None, until_s=0.0),
             last=None, warnings=[], counters=Counters(clients=self.counts.clients), latency={}, ticks={}, uptime_s=1.0,
             rss_mb=1.0, version="0", rig="fake",
         )  # fmt: skip
+        return status.model_copy(update=self.changes)
 
     def submit(self, request: Request) -> FakeTicket:
         ticket = FakeTicket(request)
@@ -88,6 +95,8 @@ class FakeEngine:
             if any(other.answer is None for other in self.accepted):
                 raise BusyError("something runs")
             self.accepted.append(ticket)
+        elif self.patient:
+            self.waiting.append(ticket)
         else:
             ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
         self._note(request.method)
@@ -116,10 +125,15 @@ class FakeEngine:
     def beat(self, loop: str) -> None:
         assert loop == "api"
         self.beats += 1
+        self._note("beat")
 
     def note_clients(self, counts: ClientCounts) -> None:
         self.counts = counts
         self._note("counted")
+
+    def begin(self, method: str) -> None:
+        """Let something run that no client has asked for."""
+        self.submit(Request(method, Params(), Caller(0, 0, 0, "")))
 
     # --- for the test ---------------------------------------------------------------------------------------------
 
@@ -131,6 +145,11 @@ class FakeEngine:
         ticket = self.accepted[-1]
         moved = MoveAnswer(position_um=10.0, sigma_um=0.1)
         ticket.finish(Answer(focus_answer(outcome) if ticket.request.method == "focus" else moved))
+
+    def finish_all(self) -> None:
+        """Answer what was asked and waits, in that order."""
+        for ticket in self.waiting:
+            ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
 
     def heard(self, what: Callable[[], bool], limit_s: float = 10.0) -> None:
         """Wait until the engine has heard what the test waits for."""

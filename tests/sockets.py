@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
+import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
@@ -24,6 +26,11 @@ def serving(path: Path, engine: FakeEngine | None = None) -> Iterator[FakeEngine
     engine = engine or FakeEngine()
     with ApiServer(engine, ApiSection(socket=path)):
         yield engine
+
+
+def press_ctrl_c() -> None:
+    """Interrupt the main thread, as a terminal does."""
+    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
 
 class Talker:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from elpd.cli.common import config_options, from_here, interruptible, json_option, parse_roi, print_json
-from elpd.config import Config, load
+from elpd.cli.common import config_options, interruptible, json_option, parse_roi, print_json
+from elpd.cli.daemon import daemon_unless, naming_the_holder, socket_option
 from elpd.errors import UsageError
-from elpd.focus.settings import FocusRequest
 from elpd.records import Roi
+
+if TYPE_CHECKING:
+    from elpd.cli.view import View
+    from elpd.config import Config
 
 
 @click.command("focus")
@@ -19,43 +22,71 @@ from elpd.records import Roi
     "--roi", metavar="X,Y,W,H", help="Where to focus, in sensor pixels; proposed (most texture) if not given."
 )
 @click.option("--reference", metavar="last|IMG", help="Focus on the last map, or on an image of the whole sensor.")
+@click.option("--preset", metavar="NAME", help="Begin where this preset is, in its region (daemon only).")
 @click.option("--foreground", is_flag=True, help="Focus from this process, not through the daemon.")
 @click.option("--dry-run", is_flag=True, help="Everything but motion of the lens.")
+@socket_option
 @config_options
 @json_option
 def command(
     *,
     roi: str | None,
     reference: str | None,
+    preset: str | None,
     foreground: bool,
     dry_run: bool,
+    socket: Path | None,
     config_path: Path | None,
     overrides: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Focus once: exit 0 in focus, 1 not found, 2 usage, 3 device, 4 busy or unreachable."""
-    from_here(foreground=foreground, config_path=config_path, overrides=overrides)
+    region = parse_roi(roi)
+    client = daemon_unless(foreground=foreground, config_path=config_path, overrides=overrides, socket=socket)
+    if client is None and preset is not None:
+        raise UsageError("--preset: presets are the daemon's; leave out --foreground, --config and --set")
+    from elpd.cli.view import open_view  # noqa: PLC0415  (after the request is known to be well formed: numpy)
+
+    def focus(view: View | None) -> dict[str, Any]:
+        if client is None:
+            return _from_here(region, reference, config_path, overrides, view, dry_run=dry_run)
+        from elpd.cli.focus_by_daemon import focus_by  # noqa: PLC0415
+
+        return focus_by(client, roi=region, reference=reference, preset=preset, dry_run=dry_run, view=view)
+
+    if as_json:
+        fields = focus(None)
+        print_json(fields)
+    else:
+        with open_view() as view:
+            fields = focus(view)
+        _tell(fields)
+    return 0 if fields["outcome"] == "FOCUSED" else 1
+
+
+def _from_here(
+    region: Roi | None,
+    reference: str | None,
+    config_path: Path | None,
+    overrides: tuple[str, ...],
+    view: View | None,
+    *,
+    dry_run: bool,
+) -> dict[str, Any]:
+    from elpd.config import load  # noqa: PLC0415  (a daemon's client needs none of these)
+    from elpd.focus.settings import FocusRequest  # noqa: PLC0415
+
     config = load(config_path, overrides)
     request = FocusRequest(
-        roi=parse_roi(roi) or _configured_roi(config),
-        reference=_reference_path(reference, config),
-        dry_run=dry_run,
+        roi=region or _configured_roi(config), reference=_reference_path(reference, config), dry_run=dry_run
     )
-    from elpd.cli.view import open_view  # noqa: PLC0415
-    from elpd.record.session import focus_once  # noqa: PLC0415  (after the request is known to be well formed: numba)
+    from elpd.record.session import focus_once  # noqa: PLC0415  (numba, after the request is known to be well formed)
 
-    with interruptible() as cancelled:
-        if as_json:
-            session = focus_once(config, request, None, cancelled)
-        else:
-            with open_view() as view:
-                session = focus_once(config, request, view, cancelled)
-                view.result(session.result)
-    if as_json:
-        print_json(session.fields())
-    else:
-        _tell(session.fields())
-    return 0 if session.focused else 1
+    with interruptible() as cancelled, naming_the_holder():
+        session = focus_once(config, request, view, cancelled)
+    if view is not None:
+        view.result(session.result)
+    return session.fields()
 
 
 def _configured_roi(config: Config) -> Roi | None:

@@ -8,18 +8,19 @@ import click
 
 from elpd.cli.errands import errand_options, run
 
+LIMIT_S = 30.0
+
 
 @click.command("home")
 @click.option(
     "--limit",
     "limit_s",
     type=click.FloatRange(min=0, min_open=True),
-    default=30.0,
-    show_default=True,
     metavar="S",
-    help="Give up, and stop, after so many seconds.",
+    help="Give up, and stop, after so many seconds; 30 if not given.",
 )
 @errand_options
-def command(*, limit_s: float, **options: Any) -> int:
+def command(*, limit_s: float | None, **options: Any) -> int:
     """Find the reference: exit 0 there, 3 if the lens does not get there."""
-    return run(lambda errands, _: errands.home(1000.0 * limit_s), **options)
+    only_here = None if limit_s is None else "--limit"
+    return run(lambda errands, _: errands.home(1e3 * (limit_s or LIMIT_S)), "home", {}, only_here=only_here, **options)

@@ -15,4 +15,11 @@ from elpd.cli.errands import errand_options, run, speed_option
 @errand_options
 def command(*, by_um: float, speed_um_s: float | None, **options: Any) -> int:
     """Move by UM from here and rest there."""
-    return run(lambda errands, config: errands.jog(by_um, speed_um_s or config.lens.speed_um_s), **options)
+    only_here = None if speed_um_s is None else "--speed"
+    return run(
+        lambda errands, config: errands.jog(by_um, speed_um_s or config.lens.speed_um_s),
+        "jog",
+        {"by_um": by_um},
+        only_here=only_here,
+        **options,
+    )

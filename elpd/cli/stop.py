@@ -13,4 +13,4 @@ from elpd.cli.errands import errand_options, run
 @errand_options
 def command(**options: Any) -> int:
     """Stop as hard as the controller can, and say where that was."""
-    return run(lambda errands, _: errands.stop(), **options)
+    return run(lambda errands, _: errands.stop(), "stop", {}, **options)

@@ -81,6 +81,7 @@ class ApiServer:
         self._thread = threading.Thread(target=self._run, name="elpd-api", daemon=True)
         self._connections: dict[int, Connection] = {}
         self._numbers = 0
+        self.stops = 0
         self._working: deque[Connection] = deque()
         self._to_tell: deque[Event | tuple[Connection, Number, Answer]] = deque()
         self._woken = False
@@ -95,7 +96,9 @@ class ApiServer:
 
     def start(self) -> None:
         """Listen. Raises ``BusyError`` or ``ConfigError`` if that cannot be."""
-        if not self._listening.sockets:
+        if self._listening.sockets:
+            self._listening.claim()
+        else:
             self._listening = listen_at(self._section.socket or default_path())
         self._loop = asyncio.new_event_loop()
         self._thread.start()
@@ -193,7 +196,8 @@ class ApiServer:
         self._log.debug("client joined", pid=peer.pid, uid=peer.uid, name=peer.name, operates=connection.operates)
 
     def urgent(self, connection: Connection, call: Call) -> None:
-        """Do it now."""
+        """Do it now. What moves the lens and came before it, from whomever, will not be begun after it."""
+        self.stops += connection.operates
         self._desk.do(connection, call)
 
     def waits(self, connection: Connection) -> None:
@@ -228,7 +232,8 @@ class ApiServer:
         for _ in range(min(LINES_A_TURN, len(self._working))):
             connection = self._working.popleft()
             if connection.lines:
-                self._desk.take(connection, connection.lines.popleft())
+                line, stops = connection.lines.popleft()
+                self._desk.take(connection, line, overtaken=stops < self.stops)
             if connection.lines:
                 self._working.append(connection)
         if self._working:
@@ -293,4 +298,5 @@ def _samples_before(connection: Connection, event: Event) -> list[SampleEvent]:
 def _send_event(connection: Connection, body: str, *, droppable: bool) -> None:
     """Send an event, numbered for this client: a number that is missing was dropped."""
     connection.told += 1
-    connection.send(f'{{"seq":{connection.told},{body[1:]}\n'.encode(), droppable=droppable)
+    line = f'{{"seq":{connection.told},{body[1:]}\n'.encode()
+    connection.send(line, droppable=droppable, seq=connection.told)

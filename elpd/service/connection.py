@@ -42,6 +42,9 @@ STALL_S = 5.0
 class Owner(Protocol):
     """The server, as a connection sees it."""
 
+    stops: int
+    """How many STOPs and cancellations there have been."""
+
     def joined(self, connection: Connection) -> None:
         """Hear that a client is there."""
         ...
@@ -76,8 +79,9 @@ class Connection(asyncio.BufferedProtocol):
         self._written = 0
         self._taken, self._taken_s = 0, 0.0
         self._ended = False
-        self.lines: deque[bytes | None] = deque()
-        """Requests that wait to be looked at; ``None`` for a line past the limit."""
+        self.lines: deque[tuple[bytes | None, int]] = deque()
+        """Requests that wait to be looked at, with how many STOPs there had been when they came; ``None`` for a line
+        past the limit."""
         self.caller: Caller | None = None
         self.operates = False
         self.stop_only = False
@@ -107,7 +111,7 @@ class Connection(asyncio.BufferedProtocol):
         idle = not self.lines
         for line in self._cutter.feed(memoryview(self._buffer)[:nbytes]):
             if line is None or not may_be_urgent(line) or not self._did_at_once(line):
-                self.lines.append(line)
+                self.lines.append((line, self._owner.stops))
         if len(self.lines) > MOST_LINES_WAITING:
             self.drop(f"more than {MOST_LINES_WAITING} requests wait for an answer")
         elif self._cutter.skipped > MOST_SKIPPED:
@@ -125,7 +129,7 @@ class Connection(asyncio.BufferedProtocol):
         self._full = True
 
     def resume_writing(self) -> None:
-        """Pass on what waits, the news of what was dropped first."""
+        """Pass on what waits."""
         self._full = False
         self._pour()
 
@@ -149,14 +153,17 @@ class Connection(asyncio.BufferedProtocol):
         """Whether lines still reach the client."""
         return self._transport is not None and not self._transport.is_closing()
 
-    def send(self, line: bytes, *, droppable: bool = False) -> None:
-        """Send a line, or let it wait; whoever does not read loses samples first, then the connection."""
+    def send(self, line: bytes, *, droppable: bool = False, seq: int = 0) -> None:
+        """Send a line, or let it wait; whoever does not read loses samples first, then the connection.
+
+        *seq* is an event's number, 0 for an answer.
+        """
         if self._transport is None or self._transport.is_closing():
             return
         if not self._full and not self._outbox:
             self._write(line)
             return
-        dropped = self._outbox.push(line, droppable=droppable)
+        dropped = self._outbox.push(line, droppable=droppable, seq=seq)
         if dropped < 0:
             self.drop(f"more than {self._outbox.bound_bytes >> 10} KiB of answers wait to be read")
         elif dropped:
@@ -213,10 +220,6 @@ class Connection(asyncio.BufferedProtocol):
         return True
 
     def _pour(self) -> None:
-        dropped = self._outbox.take_dropped()
-        if dropped:
-            self.told += 1
-            self._write(b'{"event":"dropped","seq":%d,"count":%d}\n' % (self.told, dropped))
         while not self._full and (line := self._outbox.pop()) is not None:
             self._write(line)
 

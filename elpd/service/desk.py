@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from elpd.service.lines import Call, Number
     from elpd.service.messages import Result
 
+MOVING = frozenset({"focus", "home", "move", "jog", "preset", "mode"})
+"""What may set the lens in motion, now or by itself later: never begun after a STOP that was sent later."""
+
 MOST_IN_FLIGHT = 8
 """Requests of one client that wait for their answers."""
 
@@ -57,14 +60,18 @@ class Desk:
         self._digest = schema_digest()
         self._log = structlog.get_logger()
 
-    def take(self, connection: Connection, line: bytes | None) -> None:
-        """Do what a waiting line asks for."""
+    def take(self, connection: Connection, line: bytes | None, *, overtaken: bool) -> None:
+        """Do what a waiting line asks for; nothing that moves the lens if a STOP has *overtaken* it."""
         try:
             if line is None:
                 raise RefusedLine(None, too_long())
             call = read_call(line)
         except RefusedLine as refused:
             connection.send(error_line(refused.number, error_body(refused.error)))
+            return
+        if overtaken and call.method in MOVING:
+            error = BusyError(f"{call.method}: a stop or cancel came after this and was done first; ask again")
+            connection.send(error_line(call.number, error_body(error)))
             return
         self.do(connection, call)
 

@@ -42,6 +42,14 @@ class Listening:
     _lock: int | None = None
     _inode: tuple[int, int] | None = field(default=None)
 
+    def claim(self) -> None:
+        """Hold the lock of a socket that was handed over, where its folder lets us, so that others find this process.
+
+        Raises ``BusyError`` if another daemon holds it.
+        """
+        with suppress(OSError):
+            self._lock = _locked(Path(os.fsdecode(self.sockets[0].getsockname())))
+
     def close(self) -> None:
         """Listen no more; remove the file if it is still the one that was made here."""
         for listener in self.sockets:

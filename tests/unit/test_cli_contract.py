@@ -162,7 +162,7 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
 @pytest.mark.parametrize(
     ("arguments", "code", "kind", "told"),
     [
-        (["dance"], 2, "UsageError", "there is no command 'dance'; there are calibrate, check"),
+        (["dance"], 2, "UsageError", "there is no command 'dance'; there are calibrate, cancel"),
         ([], 2, "UsageError", "No such option"),
         (["focus", "--foregruond"], 2, "UsageError", "No such option"),
         (["focus"], 4, "BusyError", "no daemon answers"),

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 import subprocess
 import sys
 import threading
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from sockets import serving
+from sockets import press_ctrl_c, serving
 
 from elpd.client import AsyncClient, Client, socket_path
 from elpd.client.wire import SYSTEM_SOCKET
@@ -103,7 +102,7 @@ def test_a_focus_that_takes_too_long_is_cancelled(rig: Client, engine: FakeEngin
 def test_ctrl_c_cancels_the_cycle(rig: Client, engine: FakeEngine) -> None:
     def press() -> None:
         engine.heard(lambda: "focus" in engine.calls)
-        signal.raise_signal(signal.SIGINT)
+        press_ctrl_c()
 
     presser = threading.Thread(target=press)
     presser.start()
