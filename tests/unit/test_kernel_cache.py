@@ -39,6 +39,7 @@ def test_a_damaged_cache_is_told_of_and_not_used(tmp_path: Path, damage: bytes) 
     out, err = _run(tmp_path, cache)
     assert out == "42"
     assert "kernel cache not used" in err
+    assert _run(tmp_path, cache) == ("42", ""), "it was written anew"
 
 
 def test_without_a_folder_for_the_cache_there_is_none(tmp_path: Path) -> None:
