@@ -22,6 +22,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+import structlog
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 
@@ -60,11 +61,21 @@ class _Cache(FunctionCache):  # type: ignore[misc]  # numba ships no types
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        self._kernel = function.__name__
         self._cache_file = IndexDataCacheFile(
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=(self._impl.locator.get_source_stamp(), _taken_in(function)),
         )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what is kept for a signature; a torn or foreign file is forgotten, said, and written anew."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # noqa: BLE001  (a damaged pickle raises anything)
+            self.flush()
+            structlog.get_logger().warning("damaged kernel made anew", kernel=self._kernel, reason=repr(error))
+            return None
 
 
 def _taken_in(function: Any) -> str:
