@@ -70,14 +70,13 @@ class _Cache(FunctionCache):  # type: ignore[misc]  # numba ships no types
         self._kernel = f"{function.__module__}.{function.__name__}"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what is kept for a signature; files that are damaged are emptied, and the kernel is compiled."""
+        """Return what is kept for a signature; a torn or foreign file is forgotten, said, and written anew."""
         try:
             return super().load_overload(sig, target_context)
-        except Exception as error:  # noqa: BLE001  (a damaged file unpickles into anything)
-            reason = f"{type(error).__name__}: {error}"
-            structlog.get_logger().warning("kernel cache not used", kernel=self._kernel, reason=reason)
-            with suppress(OSError):
+        except Exception as error:  # noqa: BLE001  (a damaged pickle raises anything)
+            with suppress(OSError):  # a cache that cannot be written is not used at all
                 self.flush()
+            structlog.get_logger().warning("damaged kernel made anew", kernel=self._kernel, reason=repr(error))
             return None
 
 

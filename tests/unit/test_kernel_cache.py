@@ -1,4 +1,4 @@
-"""The kernels' cache is an optimisation: missing, read-only or damaged, it costs time and nothing else."""
+"""Kernels without a cache, with one, and with one that somebody damaged: they compile all the same."""
 
 from __future__ import annotations
 
@@ -12,48 +12,47 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-CODE = """
-import sys
-sys.path.insert(0, sys.argv[1])
-import kernels
-print(kernels.double(21))
-"""
-KERNELS = """
+MODULE = """
 from elpd.events.jit import kernel
 
 @kernel("int64(int64)")
-def double(x):
-    return 2 * x
+def doubled(number):
+    return 2 * number
 """
 
 
-@pytest.mark.parametrize("damage", [b"", b"\x80\x04garbage", bytes(range(64))])
-def test_a_damaged_cache_is_told_of_and_not_used(tmp_path: Path, damage: bytes) -> None:
-    (tmp_path / "kernels.py").write_text(KERNELS)
-    cache = tmp_path / "cache"
-    assert _run(tmp_path, cache) == ("42", "")
-    files = [path for path in cache.rglob("*") if path.is_file()]
-    assert files
-    for path in files:
-        path.write_bytes(damage)
-    out, err = _run(tmp_path, cache)
-    assert out == "42"
-    assert "kernel cache not used" in err
-    assert _run(tmp_path, cache) == ("42", ""), "it was written anew"
-
-
-def test_without_a_folder_for_the_cache_there_is_none(tmp_path: Path) -> None:
-    (tmp_path / "kernels.py").write_text(KERNELS)
-    (tmp_path / "file").write_text("not a folder")
-    assert _run(tmp_path, tmp_path / "file" / "cache")[0] == "42"
-
-
-def _run(folder: Path, cache: Path) -> tuple[str, str]:
-    ran = subprocess.run(
-        [sys.executable, "-c", CODE, str(folder)],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+def run(folder: Path) -> str:
+    """Return what was warned of, after the kernel has answered."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from elpd import log; log.configure(); import small; print(small.doubled(21))"],
+        cwd=folder,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
         check=True,
     )
-    return ran.stdout.strip().splitlines()[-1], ran.stderr + "".join(ran.stdout.splitlines(keepends=True)[:-1])
+    assert done.stdout == "42\n"
+    return done.stderr
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "small.py").write_text(MODULE, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_a_damaged_cache_is_made_anew_and_said(folder: Path, ending: str) -> None:
+    assert run(folder) == ""
+    (cached,) = folder.glob(f"cache/*/small.doubled-*.{ending}")
+    for damage in (b"garbage", b"", cached.read_bytes()[:-5]):
+        cached.write_bytes(damage)
+        assert "damaged kernel made anew" in run(folder)
+        assert cached.read_bytes() != damage
+        assert run(folder) == ""
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(folder: Path) -> None:
+    (folder / "cache").write_text("no folder", encoding="utf-8")
+    run(folder)
+    assert (folder / "cache").read_text(encoding="utf-8") == "no folder"
