@@ -298,6 +298,20 @@ class Remarks(Protocol):
 
 
 @runtime_checkable
+class TakesMarks(Protocol):
+    """A lens whose controller makes an edge on a line each time a certain position is reached, wired to the camera."""
+
+    @property
+    def mark_channel(self) -> int | None:
+        """On which of the camera's trigger channels the edges come; ``None`` where nothing is wired."""
+        ...
+
+    def mark(self, when: HostNs) -> bool:
+        """Take an edge that the camera stamped, so at one of those positions; say whether it is believed."""
+        ...
+
+
+@runtime_checkable
 class Closeable(Protocol):
     """Anything to give back at the end."""
 
@@ -362,12 +376,14 @@ class FoundDevice:
     """Something that is plugged in: a serial port, a camera on the USB.
 
     ``next_step`` says what a person must do before it can be used, ``None`` where nothing stands in the way.
+    ``drivers`` are the installed entry points that would open it, as far as that can be told without opening it.
     """
 
     kind: str
     name: str
     where: str
     next_step: str | None = None
+    drivers: tuple[str, ...] = ()
 
 
 class Discovery(Protocol):
@@ -444,15 +460,13 @@ class WriterTraits:
 
     ``encoding`` names the raw words that are taken as they are, beside arrays, ``None`` where there are none;
     ``triggers`` and ``frames`` say what else is kept. ``first_limit_us`` is the largest time that the first event may
-    have (``None``: any). ``appends`` says that what was written is readable at any moment, so that a full disk costs
-    only what comes after.
+    have (``None``: any).
     """
 
     encoding: Encoding | None = None
     triggers: bool = False
     frames: bool = False
     first_limit_us: int | None = None
-    appends: bool = True
 
 
 class RecordingWriter(Protocol):
@@ -492,6 +506,10 @@ class WritableFormat(Protocol):
 
     def can_write(self, word: str) -> str | None:
         """Say what is missing to write *word* here (a package, as a line to type), ``None`` if nothing is."""
+        ...
+
+    def appends(self, word: str) -> bool:
+        """Say whether what was written is readable at any moment: then a full disk costs only what comes after."""
         ...
 
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> RecordingWriter:

@@ -109,6 +109,30 @@ def lens_alone(config: Config) -> Iterator[tuple[Clock, Lens, LensScale]]:
             lens.close()
 
 
+@contextmanager
+def camera_alone(config: Config) -> Iterator[tuple[Clock, EventCamera]]:
+    """Open the camera that *config* describes, without a lens, and give it back at the end. Nothing can move.
+
+    The simulated camera comes with its world, whose lens stands still. Raises what ``build`` raises.
+    """
+    if config.rig == "sim" and config.camera.driver == "sim":
+        parts = build(config)
+        try:
+            yield parts.clock, parts.camera
+        finally:
+            release(parts)
+        return
+    if config.camera.driver == "sim":
+        raise ConfigError('camera.driver: rig = "hardware" needs a driver; see config/evk4-grbl.toml')
+    clock = MonotonicClock()
+    camera = _open("elpd.cameras", config.camera, clock)
+    try:
+        yield clock, camera
+    finally:
+        if isinstance(camera, Closeable):
+            camera.close()
+
+
 def release(parts: RigParts) -> None:
     """Give the devices back, the lens last: it must be able to stop until the end. An aperture stays as it is."""
     for device in (parts.camera, parts.lens):

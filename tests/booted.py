@@ -58,9 +58,11 @@ while IFS="=" read -r inside outside; do
     [ -n "$inside" ] || continue
     mkdir -p "./$inside"; mount --bind "$outside" "./$inside"; mount -o remount,bind,ro "./$inside"
 done <"$BINDS"
-chroot . systemd-sysusers
+mkdir -p mnt; pivot_root . mnt; umount -l mnt  # not chroot: from inside one no user namespace can be made
+cd /; systemd-sysusers
+[ ! -d /var/cache/elpd ] || chown -R elpd:elpd /var/cache/elpd
 export container=tests
-exec chroot . /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
+exec /lib/systemd/systemd --system --unit=tests.target --show-status=0 --log-target=journal
 """
 
 _TRIAL = """
@@ -118,6 +120,20 @@ def installation() -> tuple[dict[str, str], dict[str, Path]]:
     return files, binds
 
 
+def compiled_kernels() -> dict[str, Path]:
+    """Return where the service keeps kernels, for each that lies compiled in this checkout: it need not begin cold.
+
+    A kernel belongs to its source by that file's time and size, which a bind keeps, and to its folder by name.
+    """
+    from numba.core.caching import _CacheLocator  # noqa: PLC0415
+
+    found = {}
+    for path in [*ROOT.glob("elpd/**/__pycache__/*.nb?"), *ROOT.glob("drivers/**/__pycache__/*.nb?")]:
+        source = Path("/opt/source", path.parents[1].relative_to(ROOT), "any.py")
+        found[f"var/cache/elpd/numba/{_CacheLocator.get_suitable_cache_subpath(str(source))}/{path.name}"] = path
+    return found
+
+
 def _installed() -> dict[str, str]:
     """Return what tools/install puts outside of the virtual environment."""
     with tempfile.TemporaryDirectory() as folder:
@@ -131,10 +147,13 @@ class Booted:
     """A booted systemd. Call it with a command line to run that inside, as root.
 
     *files* maps paths inside to their text (``#!`` makes them executable), *binds* paths inside to folders outside,
-    read-only.
+    read-only, *copies* paths inside to files outside.
     """
 
-    def __init__(self, files: Mapping[str, str], binds: Mapping[str, Path]) -> None:
+    def __init__(
+        self, files: Mapping[str, str], binds: Mapping[str, Path], copies: Mapping[str, Path] | None = None
+    ) -> None:
+        self._copies = dict(copies or {})
         self._files = {
             "etc/systemd/system/tests.target": _TARGET,
             **{f"etc/systemd/system/{name}.timer": "" for name in _MASKED},  # an empty file masks
@@ -190,7 +209,7 @@ class Booted:
         arguments = [*self._inside(), "journalctl", "--no-pager", "--lines=60", "--output=short-monotonic"]
         return subprocess.run(arguments, capture_output=True, text=True, check=False, cwd="/", env=_ENV).stdout
 
-    def until(self, holds: Callable[[], Any], what: str, within_s: float = 20.0) -> Any:
+    def until(self, holds: Callable[[], Any], what: str, within_s: float = 120.0) -> Any:
         """Ask until *holds* returns something true, and return that; an ``AssertionError`` with the journal if late."""
         deadline = time.monotonic() + within_s
         while not (answer := holds()):
@@ -217,8 +236,12 @@ class Booted:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content, encoding="utf-8")
             path.chmod(0o755 if content.startswith("#!") else 0o644)
+        for name, outside in self._copies.items():
+            (files / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(outside, files / name)
         (files / "opt/elpd/bin").mkdir(parents=True, exist_ok=True)
-        (files / f"opt/elpd/bin/{PYTHON}").symlink_to(f"/opt/python/bin/{PYTHON}")
+        for name in ("python3", PYTHON):
+            (files / "opt/elpd/bin" / name).symlink_to(f"/opt/python/bin/{PYTHON}")
         for folder in files.rglob("*"):
             if folder.is_dir():
                 folder.chmod(0o755)

@@ -86,6 +86,10 @@ class FakeDaemon:
         await self.until(lambda: sum(name == method for name, _ in self.asked) >= times)
         return [params for name, params in self.asked if name == method][-1]
 
+    async def heard(self) -> None:
+        """Wait until somebody listens: what was told before is lost."""
+        await self.until(lambda: bool(self._listeners))
+
     @property
     def listeners(self) -> int:
         return len(self._listeners)

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import create_server
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import aiohttp
 from fake_daemon import FakeDaemon
@@ -65,7 +65,7 @@ class Events:
         self._asking = gateway.get("/api/events", **headers)
         self.last_seen = last_seen
 
-    async def __aenter__(self) -> Events:
+    async def __aenter__(self) -> Self:
         self.response = await self._asking.__aenter__()
         assert self.response.status == 200
         return self

@@ -80,6 +80,32 @@ def decode_evt3(words: Any, width: int, height: int) -> Any:
     return items, odd, (rate[0x014], rate[0x016])
 
 
+def survey_evt3(words: Any) -> tuple[int | None, int, int]:
+    """Return the time at the end, how many events, how many the rate controller held back."""
+    items, _, _ = decode_evt3(words, 1 << 12, 1 << 12)
+    times = [item[1] for item in items if item[0] == "time"]
+    events = sum(item[0] in ("event", "outside") for item in items)
+    dropped, before, words = 0, None, list(map(int, words))
+    begin = next((i for i, word in enumerate(words) if word >> 12 == 0x8), len(words))
+    subtype, continued = None, []
+    for word in words[begin:]:
+        kind, content = word >> 12, word & 0xFFF
+        if kind == 0xE:
+            subtype, continued = content, []
+        elif kind in (0xF, 0x7) and subtype in (0x014, 0x016):
+            if kind == 0xF and len(continued) < 2:
+                continued.append(content)
+                continue
+            if kind == 0x7 and len(continued) == 2:
+                count = continued[0] + (continued[1] << 12) + ((content & 0xF) << 24)
+                if subtype == 0x014:
+                    before = count
+                elif before is not None:
+                    dropped, before = dropped + max(0, before - count), None
+            subtype = None
+    return times[-1] if times else None, events, dropped
+
+
 def decode_evt2(words: Any, width: int, height: int) -> Any:
     items, odd = [], Counter()
     loop, high = 0, None

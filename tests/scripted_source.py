@@ -51,7 +51,9 @@ class ScriptedSource:
 
     def read(self, timeout_s: float) -> Captured | None:
         settings, number = self._settings, self._sent
-        if number == settings.get("ends_at", -1):
+        if number == settings.get("ends_at", -1) and not os.path.exists(settings.get("once", "")):  # noqa: PTH110
+            if "once" in settings:
+                open(settings["once"], "w", encoding="utf-8").close()  # noqa: PTH123
             self._end(settings["how"])
         gated = "trigger" in self.facts.abilities and not any(call[0] == "enable_trigger" for call in self._calls)
         if gated or number >= settings.get("packets", 1 << 40):

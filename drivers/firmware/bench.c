@@ -36,6 +36,8 @@ typedef struct {
     uint64_t sync_edges, steps_made;
     step_t steps[LOG];
     uint32_t steps_put, steps_got;
+    step_t syncs[LOG]; /* way: the level after the edge */
+    uint32_t syncs_put, syncs_got;
     sent_t sent[LOG];
     uint32_t sent_put, sent_got;
     uint8_t queue[QUEUE];
@@ -83,6 +85,9 @@ static void on_sync(struct avr_irq_t *irq, uint32_t value, void *param) {
     if ((value != 0) != bench->sync) {
         bench->sync = value != 0;
         bench->sync_edges++;
+        step_t *edge = &bench->syncs[bench->syncs_put++ % LOG];
+        edge->cycle = bench->avr->cycle;
+        edge->way = bench->sync;
     }
 }
 
@@ -190,9 +195,19 @@ void bench_place(void *handle, int32_t rotor) {
     }
 }
 
+static avr_cycle_count_t wake(avr_t *avr, avr_cycle_count_t when, void *param) {
+    (void)avr;
+    (void)when;
+    (void)param;
+    return 0;
+}
+
 /* Run until the cycle count has reached `until`; returns 0, or -1 when the AVR has crashed. */
 int bench_run(void *handle, uint64_t until) {
     bench_t *bench = handle;
+    if (until > bench->avr->cycle) { /* asleep it would go on to its next interrupt, past bytes that are yet to come */
+        avr_cycle_timer_register(bench->avr, until - bench->avr->cycle, wake, bench);
+    }
     while (bench->avr->cycle < until) {
         while (!bench->full && bench->queue_got != bench->queue_put) {
             avr_raise_irq(bench->uart_in, bench->queue[bench->queue_got++ % QUEUE]);
@@ -232,6 +247,18 @@ uint32_t bench_steps(void *handle, uint64_t *cycles, int32_t *ways, uint32_t roo
         step_t *step = &bench->steps[bench->steps_got++ % LOG];
         cycles[count] = step->cycle;
         ways[count] = step->way;
+    }
+    return count;
+}
+
+/* Copy out the edges on SYNC since the last call, each with the level after it; returns how many. */
+uint32_t bench_syncs(void *handle, uint64_t *cycles, int32_t *levels, uint32_t room) {
+    bench_t *bench = handle;
+    uint32_t count = 0;
+    for (; count < room && bench->syncs_got != bench->syncs_put; count++) {
+        step_t *edge = &bench->syncs[bench->syncs_got++ % LOG];
+        cycles[count] = edge->cycle;
+        levels[count] = edge->way;
     }
     return count;
 }

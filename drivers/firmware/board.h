@@ -3,7 +3,7 @@
  *   D9  PB1  STEP        to the stepper driver, rising edge
  *   D8  PB0  DIR         high: towards larger positions
  *   D10 PB2  ENABLE      low: driver on
- *   D11 PB3  SYNC        one edge every so many steps, in the same instruction as the step: to a camera's trigger-in
+ *   D11 PB3  SYNC        an edge at every multiple of so many steps, in the same instruction as the step: to a camera's trigger-in
  *   D2  PD2  LIMIT_MIN   switch to ground, internal pull-up
  *   D3  PD3  LIMIT_MAX   switch to ground, internal pull-up
  *   D5  PD5  IRIS        high: open

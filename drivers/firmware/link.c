@@ -1,4 +1,5 @@
-/* Bytes and frames. Stop bytes are obeyed where they are received; frames wait for the main loop, one at a time. */
+/* Bytes and frames. Stop bytes are obeyed where they are received; a few frames may wait for the main
+ * loop, which a fast motion keeps from them for longer than one takes to come. */
 #include "link.h"
 
 #include <avr/interrupt.h>
@@ -11,14 +12,19 @@
 #include "protocol.h"
 
 #define SENDING 128 /* bytes, a power of two */
+#define WAITING 4   /* frames, a power of two; one of them is being received */
 
-static volatile bool framing;
+typedef struct {
+    uint8_t held; /* bytes of the body so far */
+    uint8_t stops;
+    uint8_t body[FRAME_LONGEST];
+} received_t;
+
+static bool framing;
 static bool escaped;
-static volatile uint8_t held; /* bytes of the body so far */
-static volatile bool ready;
-static volatile uint8_t ready_stops;
 static volatile bool overrun;
-static uint8_t received[FRAME_LONGEST];
+static received_t received[WAITING];
+static volatile uint8_t filling, reading; /* equal: none waits */
 
 static uint8_t sending[SENDING];
 static volatile uint8_t put, got;
@@ -40,27 +46,26 @@ ISR(USART_RX_vect) {
         return;
     }
     if (byte == BYTE_START) {
-        if (ready) {
-            overrun = true;
-        }
-        framing = !ready;
+        framing = ((filling + 1) & (WAITING - 1)) != reading;
+        overrun |= !framing;
         escaped = false;
-        held = 0;
+        received[filling].held = 0;
         return;
     }
     if (!framing) {
         return;
     }
+    received_t *frame = &received[filling];
     if (byte == BYTE_END) {
         framing = false;
-        ready_stops = motion_stops();
-        ready = true;
+        frame->stops = motion_stops();
+        filling = (filling + 1) & (WAITING - 1);
     } else if (byte == BYTE_ESCAPE) {
         escaped = true;
-    } else if (byte >= BYTE_CONTROL || held == FRAME_LONGEST) {
+    } else if (byte >= BYTE_CONTROL || frame->held == FRAME_LONGEST) {
         framing = false;
     } else {
-        received[held++] = escaped ? byte ^ ESCAPE_FLIP : byte;
+        frame->body[frame->held++] = escaped ? byte ^ ESCAPE_FLIP : byte;
         escaped = false;
     }
 }
@@ -90,15 +95,16 @@ static uint16_t crc_of(const uint8_t *bytes, uint8_t length) {
 }
 
 bool link_receive(frame_t *frame) {
-    if (!ready) {
+    if (reading == filling) {
         return false;
     }
-    uint8_t length = held;
+    const received_t *waiting = &received[reading];
+    uint8_t length = waiting->held;
     for (uint8_t i = 0; i < length; i++) {
-        frame->body[i] = received[i];
+        frame->body[i] = waiting->body[i];
     }
-    frame->stops = ready_stops;
-    ready = false;
+    frame->stops = waiting->stops;
+    reading = (reading + 1) & (WAITING - 1);
     if (length < 4) {
         frame->length = 0;
         frame->intact = false;
@@ -110,7 +116,7 @@ bool link_receive(frame_t *frame) {
     return true;
 }
 
-bool link_waiting(void) { return ready || overrun; }
+bool link_waiting(void) { return reading != filling || overrun; }
 
 bool link_overrun(void) {
     bool was;

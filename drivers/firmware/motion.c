@@ -51,7 +51,7 @@ static uint32_t ramp;      /* n: steps from rest, steps to rest */
 static int32_t bound;      /* where to be at rest */
 static uint32_t waiting;   /* ticks still to pass before the step, beyond the compare that is set */
 static uint8_t fraction;
-static uint16_t sync_left;
+static uint16_t sync_phase; /* position modulo sync_steps */
 
 /* Settings; written only at rest. */
 static uint32_t rest_interval; /* from rest to the first step, and from the last to rest: f sqrt(2 / a) */
@@ -134,6 +134,24 @@ static void rest(void) {
 
 ISR(TIMER1_OVF_vect) { overflows++; }
 
+/* Count the step that is being made; whether it leads to a multiple of sync_steps, from either side. */
+static inline bool sync_reached(void) {
+    if (direction > 0) {
+        sync_phase = sync_phase + 1 == sync_steps ? 0 : sync_phase + 1;
+    } else {
+        sync_phase = sync_phase ? sync_phase - 1 : sync_steps - 1;
+    }
+    return sync_phase == 0;
+}
+
+/* Where the position lies between two edges, after it was said anew. Interrupts are off, or nothing moves. */
+static void sync_from(int32_t at) {
+    if (sync_steps) {
+        int32_t rest = at % (int32_t)sync_steps;
+        sync_phase = (uint16_t)(rest < 0 ? rest + sync_steps : rest);
+    }
+}
+
 /* One step, and the plan for the next. The pins change within a microsecond of the compare; the division comes after,
  * with interrupts on, so that a stop byte is obeyed meanwhile. */
 ISR(TIMER1_COMPA_vect) {
@@ -146,8 +164,7 @@ ISR(TIMER1_COMPA_vect) {
         return;
     }
     uint8_t pins = PORTB | (1u << STEP_BIT);
-    if (sync_left && --sync_left == 0) {
-        sync_left = sync_steps;
+    if (sync_steps && sync_reached()) {
         pins ^= 1u << SYNC_BIT;
     }
     PORTB = pins;
@@ -247,7 +264,10 @@ bool motion_configure(uint32_t acceleration, uint16_t speed, int32_t min, int32_
     soft_min = min;
     soft_max = max;
     dead_man_ms = dead_man;
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { sync_left = sync_steps = sync; }
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        sync_steps = sync;
+        sync_from(position);
+    }
     return true;
 }
 
@@ -315,6 +335,7 @@ void motion_poll(void) {
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
             rest();
             position = 0;
+            sync_phase = 0;
             referenced = true;
         }
         homing = HOMING_NOT;
@@ -329,6 +350,7 @@ bool motion_set_position(int32_t value) {
         return false;
     }
     position = value;
+    sync_from(value);
     referenced = true;
     return true;
 }

@@ -37,6 +37,7 @@ COMMANDS = {
     "move": "move the lens to a place",
     "park": "stop the lens past any daemon: the last resort",
     "preset": "places of the lens that the daemon remembers",
+    "record": "what the camera sees, to a file; nothing moves",
     "replay": "run a recorded cycle again, to the same decision",
     "roi": "the daemon's regions",
     "serve": "the daemon: own the rig, answer on a socket",

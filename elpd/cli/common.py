@@ -18,6 +18,9 @@ from elpd.records import Geometry, Roi
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+MAX_SIDE = 2048
+"""The most pixels of any sensor's side: addresses have 11 bits."""
+
 F = TypeVar("F", bound="Callable[..., Any]")
 
 
@@ -72,14 +75,17 @@ def parse_roi(text: str | None) -> Roi | None:
     return Roi(x, y, width, height)
 
 
-def parse_geometry(text: str | None) -> Geometry | None:
-    """Read ``WxH``."""
+def parse_size(text: str | None) -> Geometry | None:
+    """Read ``W,H``, a sensor's size."""
     if text is None:
         return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise UsageError(f"--geometry is WxH in whole pixels, such as 1280x720; got {text!r}")
-    return Geometry(int(width), int(height))
+    try:
+        width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--size is W,H in whole pixels, such as 346,260; got {text!r}") from None
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise UsageError(f"--size {width},{height}: a sensor has 1 to {MAX_SIDE} pixels each way")
+    return Geometry(width, height)
 
 
 def parse_interval_us(text: str | None, option: str) -> tuple[int, int] | None:

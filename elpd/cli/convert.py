@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from elpd.cli.common import config_options, json_option, parse_geometry, parse_roi, print_json
+from elpd.cli.common import config_options, json_option, parse_roi, parse_size, print_json
 from elpd.config import load
 from elpd.record.convert import Slice, convert
 
@@ -23,7 +23,7 @@ from elpd.record.convert import Slice, convert
 @click.option("--roi", metavar="X,Y,W,H", help="Keep the events of this region; addresses stay as they are.")
 @click.option("--from-us", type=int, metavar="T", help="Keep what is not earlier, in us of the sensor's clock.")
 @click.option("--to-us", type=int, metavar="T", help="Keep what is earlier.")
-@click.option("--geometry", metavar="WxH", help="The sensor's size, where the file does not say it.")
+@click.option("--size", metavar="W,H", help="The sensor's size, where the file does not say it.")
 @click.option("--force", is_flag=True, help="Replace OUT if it exists.")
 @config_options
 @json_option
@@ -35,7 +35,7 @@ def command(
     roi: str | None,
     from_us: int | None,
     to_us: int | None,
-    geometry: str | None,
+    size: str | None,
     force: bool,
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -44,14 +44,13 @@ def command(
     """Write an event file in another format, or a part of it."""
     load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
     part = Slice(parse_roi(roi), from_us, to_us)
-    answer = convert(source, out, word=word, part=part, geometry=parse_geometry(geometry), force=force)
+    answer = convert(source, out, word=word, part=part, geometry=parse_size(size), force=force)
     if as_json:
         print_json(answer)
         return
-    size = out.stat().st_size
-    print(
-        f"{out}: {answer['format']}, {answer['width']}x{answer['height']}, {answer['events']:,} events, {size:,} bytes"
-    )
+    length = out.stat().st_size
+    print(f"{out}: {answer['format']}, {answer['width']}x{answer['height']}")
+    print(f"events    {answer['events']:,}, {length:,} bytes")
     if answer["triggers"] or answer["frames"]:
         print(f"with it   {answer['triggers']} trigger edges, {answer['frames']} frames")
     if answer["lost"]:

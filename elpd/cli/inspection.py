@@ -127,11 +127,16 @@ def devices() -> list[Finding]:
         if not found:
             findings.append(Finding("devices", point.name, Status.NOTE, "nothing found"))
         for device in found:
-            data = {"kind": device.kind, "device": device.name, "where": device.where}
+            data = {
+                "kind": device.kind,
+                "device": device.name,
+                "where": device.where,
+                "drivers": list(device.drivers),
+            }
             status = Status.OK if device.next_step is None else Status.PROBLEM
-            findings.append(
-                Finding("devices", device.kind, status, f"{device.where}  {device.name}", device.next_step, data)
-            )
+            opened_by = f", driver = {' or '.join(device.drivers)}" if device.drivers else ""
+            told = f"{device.where}  {device.name}{opened_by}"
+            findings.append(Finding("devices", device.kind, status, told, device.next_step, data))
     return findings
 
 

@@ -7,19 +7,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from elpd.cli.common import config_options, json_option, parse_interval_us, print_json
+from elpd.cli.common import config_options, json_option, parse_interval_us, parse_size, print_json
 from elpd.config import load
 from elpd.errors import FormatError, UsageError
-from elpd.events.registers import MAX_SIDE
 from elpd.events.stream import EventStream, open_recording
-from elpd.records import Geometry
 from elpd.units import SensorUs
 from elpd.vision.first_events import FirstEventMap
 from elpd.vision.pictures import write_display_png, write_log_png
 from elpd.vision.temporal_map import quality, read_transmittance, temporal_image
 
 if TYPE_CHECKING:
-    from elpd.records import TemporalImage
+    from elpd.records import Geometry, TemporalImage
 
 PNG = click.Path(path_type=Path, dir_okay=False)
 
@@ -64,7 +62,7 @@ def command(
     load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
     aperture = parse_interval_us(interval, "--aperture-us")
     profile = read_transmittance(transmittance)
-    gathered = _gather(file, aperture, _parse_size(size))
+    gathered = _gather(file, aperture, parse_size(size))
     image = temporal_image(gathered.believed(), profile, None if aperture is None else SensorUs(aperture[0]))
     usable, verdict = quality(image)
     if out is not None:
@@ -87,18 +85,6 @@ def command(
         print_json(answer)
     else:
         _tell(image, out, "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
-
-
-def _parse_size(text: str | None) -> Geometry | None:
-    if text is None:
-        return None
-    try:
-        width, height = (int(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"--size is W,H in whole pixels, such as 346,260; got {text!r}") from None
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        raise UsageError(f"--size {width},{height}: a sensor has 1 to {MAX_SIDE} pixels each way")
-    return Geometry(width, height)
 
 
 def _gather(file: Path, aperture: tuple[int, int] | None, size: Geometry | None) -> FirstEventMap:

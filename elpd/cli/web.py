@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from elpd.cli.common import config_options, json_option, print_json
+from elpd.client import socket_path
 from elpd.config import load
 from elpd.errors import BusyError, ConfigError, UsageError
 from elpd.web.security import Gate, is_loopback, own_hosts
@@ -47,7 +48,7 @@ def command(
             print(address)
         return 0
 
-    _serve(config.web, socket or socket_path(), token, path, as_json=as_json)
+    _serve(config.web, socket_path(socket or config.api.socket), token, path, as_json=as_json)
     return 0
 
 

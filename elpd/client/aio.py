@@ -25,7 +25,7 @@ from elpd.client.wire import (
 from elpd.errors import UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncGenerator, Sequence
     from pathlib import Path
 
     from elpd.client.shapes import Event, FocusAnswer, RoiBox
@@ -114,7 +114,7 @@ class AsyncClient(AsyncMethods):
 
     async def events(
         self, kinds: Sequence[str] | None = None, rate_hz: float | None = None, *, reconnect_s: float = 0.0
-    ) -> AsyncIterator[Event]:
+    ) -> AsyncGenerator[Event, None]:
         """Yield what the daemon tells, over a connection of its own; as `Client.events`."""
         params: dict[str, Any] = {} if kinds is None else {"events": list(kinds)}
         if rate_hz is not None:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from elpd.records import CameraPacket
 
+EPOCH_STEP_US = 4096
+"""A TIME_LOW word has 12 bits: what steps back by more is no late word but another epoch of the clock."""
+
 TIME_HIGH = 0x8
 _LAYOUT = {Encoding.EVT3: (12, 12, 12), Encoding.EVT2: (28, 6, 28), Encoding.EVT21: (60, 6, 28)}
 """Where the word's kind begins, how many bits of time lie below a TIME_HIGH, and how many it has."""

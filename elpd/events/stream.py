@@ -15,13 +15,13 @@ import numpy as np
 from elpd.errors import FormatError
 from elpd.events.decoder import EventArrays
 from elpd.events.evt2 import Evt2Decoder, Evt21Decoder
-from elpd.events.evt3 import Evt3Decoder
+from elpd.events.evt3_fast import evt3_decoder
 from elpd.events.layout import event_columns
 from elpd.events.registers import MAX_SIDE
 from elpd.records import Encoding, Geometry
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from elpd.records import CameraPacket, Frame, Trigger
 
 FORMATS_GROUP = "elpd.formats"
-DECODERS: dict[Encoding, type[Evt3Decoder | Evt2Decoder | Evt21Decoder]] = {
-    Encoding.EVT3: Evt3Decoder,
+DECODERS: dict[Encoding, Callable[[Geometry], WordDecoder]] = {
+    Encoding.EVT3: evt3_decoder,
     Encoding.EVT2: Evt2Decoder,
     Encoding.EVT21: Evt21Decoder,
 }

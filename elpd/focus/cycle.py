@@ -142,6 +142,7 @@ class FocusCycle:
         self._check_request()
         try:
             self._parts.camera.start()
+            self._stage.listen_for_marks()
             try:
                 self._stage.interrupt = self._interrupt
                 outcome, reason = self._focus()
@@ -413,6 +414,7 @@ class FocusCycle:
         """Return every warning, those about what was lost or clipped last."""
         told = [*self._warnings, *guards.of_loss(self._stage.lost_events)]
         if self._watch is not None:
+            told += guards.of_marks(self._stage.marks)
             roi, frame = self._watch.roi, self._stage.frame
             told += guards.of_rate(self._watch.rate.plateau_mev_s())
             told += guards.of_frame(

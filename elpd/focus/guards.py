@@ -69,6 +69,14 @@ def of_late_lamp(flicker: Flicker | None) -> list[str]:
     ]
 
 
+def of_marks(marks: int | None) -> list[str]:
+    """Say that no position mark came where some are wired (*marks* is how many were believed, ``None``: not wired)."""
+    if marks != 0:
+        return []
+    seen = "the lens marks its positions on a line to the camera's trigger input, and the camera saw no edge that fits"
+    return [f"{seen}: check that wire, and lens.sync_channel; positions are those of the clocks alone"]
+
+
 def of_loss(lost_events: int) -> list[str]:
     """Return what there is to tell of events that never came."""
     if lost_events == 0:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from elpd.errors import CameraError, LensError
-from elpd.ports import Latency
+from elpd.events.edges import EdgeReader
+from elpd.ports import Latency, TakesMarks, TriggerInput
 from elpd.timebase import SensorClock
 from elpd.units import NS_PER_MS, HostNs, SensorUs, Steps, after_ms
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.ports import RigParts
-    from elpd.records import CameraPacket, Frame, LensReport
+    from elpd.records import CameraPacket, Frame, LensReport, Trigger
 
 READ_TIMEOUT_S = 0.002
 """One turn of a wait; the lens is polled at least this often."""
@@ -50,6 +51,10 @@ class Stage:
         self.last_packet_ns = parts.clock.now_ns()
         self.listener: Callable[[CameraPacket], object] | None = None
         """Hears every packet that is read while a phase waits."""
+        wired = isinstance(parts.lens, TakesMarks) and parts.lens.mark_channel is not None
+        self._edges = EdgeReader() if wired else None
+        self.marks = 0 if wired else None
+        """How many position marks were believed; ``None`` where none are wired."""
         self.interrupt: Callable[[], None] | None = None
         """Asked before every read; raises to end the phase."""
 
@@ -107,9 +112,24 @@ class Stage:
             self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
         if packet.frames:
             self.frame = packet.frames[-1]
+        if self._edges is not None:
+            self._mark(self._edges.of(packet))
         if self.listener is not None:
             self.listener(packet)
         return packet
+
+    def listen_for_marks(self) -> None:
+        """Let the camera stamp the lens's position marks, where they are wired."""
+        if self._edges is not None and isinstance(self.parts.camera, TriggerInput):
+            self.parts.camera.enable_trigger(on=True)
+
+    def _mark(self, edges: tuple[Trigger, ...]) -> None:
+        """Tell the lens at what times it was at places it knows."""
+        lens = self.parts.lens
+        assert isinstance(lens, TakesMarks), "edges are read for such a lens only"
+        for edge in edges:
+            if edge.id == lens.mark_channel:
+                self.marks = (self.marks or 0) + lens.mark(self.sensor_clock.to_host(edge.t_us))
 
     def rest(self, limit_ms: float, target: Steps | None = None) -> LensReport:
         """Wait until the lens rests; return the report that says so.

@@ -21,15 +21,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from elpd.errors import LensError
 from elpd.motion.kinematics import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
-from elpd.records import LensReport, PositionEstimate
-from elpd.units import NS_PER_S
-
-if TYPE_CHECKING:
-    from elpd.units import HostNs
+from elpd.records import LensFlag, LensReport, PositionEstimate
+from elpd.units import NS_PER_S, HostNs
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +98,7 @@ class _Epoch:
     delay_sigma_s: float
     number: int = 0
     anchor: tuple[float, float] | None = None
+    marked: bool = False
     steps: float = 0.0
     variance: float = 0.0
     path: list[Knot] = field(default_factory=list)
@@ -148,6 +145,8 @@ _FURTHER_STEPS = 1.0
 _MAX_REPORTS = 256
 _RELAY_S = 2e-4
 _RELAYS = 4
+MARK_NS = 2_000
+"""A mark's edge leaves with the step, and a camera stamps it to the microsecond."""
 _LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 200_000_000, NS_PER_S
 
 
@@ -241,6 +240,8 @@ class Trajectory:
         epoch = self._epochs[index]
         if epoch.reports and _says_nothing_new(epoch, report, when):
             return
+        if epoch.marked and report.moving and report.latest_ns - report.earliest_ns > 2 * MARK_NS:
+            return  # its latency, which all reports share, would outvote the marks
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
@@ -249,6 +250,16 @@ class Trajectory:
             self._follow_from(index)
         elif index + 1 < len(self._epochs):
             self._follow_from(index + 1)
+
+    def mark(self, steps: float, when_ns: int) -> None:
+        """Learn that the motor was at *steps* at *when_ns*, to a microsecond: a mark beside which no latency counts."""
+        index = self._index(when_ns)
+        epoch = self._epochs[index]
+        if not epoch.marked:
+            epoch.marked, epoch.reports = True, []
+            self._follow_from(index)
+        half = min(MARK_NS, self._timing.reply_ns)
+        self.observe(LensReport(steps, HostNs(when_ns - half), HostNs(when_ns + half), None, LensFlag.MOVING))
 
     def resume(self, report: LensReport) -> bool:
         """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
@@ -387,7 +398,7 @@ class Trajectory:
         epoch.correct(report.steps - steps, h_offset, h_delay, noise)
 
     def _variance(self, epoch: _Epoch, velocity: float, h_offset: float, h_delay: float) -> float:
-        common = velocity * self._timing.common_sigma_ns / NS_PER_S
+        common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
         return epoch.learnt(h_offset, h_delay) + common * common + self._model_variance(epoch, velocity)
 
     def _model_variance(self, epoch: _Epoch, velocity: float) -> float:

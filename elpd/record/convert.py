@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
+from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.layout import packed
 from elpd.events.stream import EventChunk, EventStream, open_recording
 from elpd.record.files import appearing_whole, format_for, refuse_to_overwrite
-from elpd.record.tally import EPOCH_STEP_US, Tally, losses
+from elpd.record.tally import Tally, losses
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs, SensorUs
 
@@ -111,14 +112,12 @@ def convert(
         size = geometry or reader.geometry
         if size is None:
             size = _extent(reader)
-            warnings.append(
-                f"the size {size.width}x{size.height} is what the events need; --geometry says the true one"
-            )
+            warnings.append(f"the size {size.width}x{size.height} is what the events need; --size says the true one")
         _check(part, size)
         with appearing_whole(out, force=force) as partial:
             writer = writes.create(partial, word, size, dict(reader.notes.get("header", {})))
             try:
-                answer = _Conversion(reader, writer, part, size).run()
+                answer = Conversion(reader, writer, part, size).run()
             finally:
                 writer.close()
     except OSError as error:
@@ -135,7 +134,7 @@ def convert(
     }
 
 
-class _Conversion:
+class Conversion:
     """One pass from a reader to a writer."""
 
     def __init__(self, reader: RecordingReader, writer: RecordingWriter, part: Slice, geometry: Geometry) -> None:

@@ -322,6 +322,7 @@ def _facts(line: dict[str, Any]) -> RigFacts:
         steps_to_um=tuple((number(steps), number(um)) for steps, um in line.get("steps_to_um", ())),
         opening_ms=number(line["opening_ms"]),
         min_latency_us=number(line["min_latency_us"]),
+        mark_channel=line.get("mark_channel"),
         abilities={device: tuple(names) for device, names in line["abilities"].items()},
     )
 

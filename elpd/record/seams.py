@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
-from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask, RigParts
+from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask, RigParts, TakesMarks, TriggerInput
 from elpd.scale import LensScale
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ class RigFacts:
     steps_to_um: tuple[tuple[float, float], ...]
     opening_ms: float | None
     min_latency_us: float | None
+    mark_channel: int | None
     abilities: dict[str, tuple[str, ...]]
 
     @classmethod
@@ -75,10 +76,11 @@ class RigFacts:
             steps_to_um=parts.scale.table,
             opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
             min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
+            mark_channel=parts.lens.mark_channel if isinstance(parts.lens, TakesMarks) else None,
             abilities={
                 "clock": _abilities(parts.clock, ("Closeable",)),
                 "camera": _abilities(camera, tuple(_PROTOCOLS)),
-                "lens": _abilities(parts.lens, ("Closeable",)),
+                "lens": _abilities(parts.lens, ("Closeable", "TakesMarks")),
             },
         )
 
@@ -127,6 +129,11 @@ def methods_of(parts: RigParts) -> dict[str, Callable[..., Any]]:
         methods["camera.apply_biases"] = camera.apply_biases
     if isinstance(camera, PixelMask):
         methods["camera.set_mask"] = camera.set_mask
+    if isinstance(camera, TriggerInput):
+        listening = camera.enable_trigger
+        methods["camera.enable_trigger"] = lambda on: listening(on=on)
+    if isinstance(lens, TakesMarks):
+        methods["lens.mark"] = lens.mark
     for name, device in (("clock", clock), ("camera", camera), ("lens", lens)):
         if isinstance(device, Closeable):
             methods[f"{name}.close"] = device.close
@@ -231,10 +238,24 @@ class _WithPixelMask(_Double):
         return cast("int", self._ask("camera.set_mask", tuple(pixels)))
 
 
+class _WithTriggerInput(_Double):
+    def enable_trigger(self, *, on: bool) -> None:
+        self._ask("camera.enable_trigger", on)
+
+
 class _WithLatency(_Double):
     @property
     def min_latency_us(self) -> float:
         return cast("float", self._facts.min_latency_us)
+
+
+class _WithMarks(_Double):
+    @property
+    def mark_channel(self) -> int | None:
+        return self._facts.mark_channel
+
+    def mark(self, when: HostNs) -> bool:
+        return cast("bool", self._ask("lens.mark", when))
 
 
 class _WithClose(_Double):
@@ -246,14 +267,18 @@ _PROTOCOLS: dict[str, Any] = {
     "HardwareRoi": HardwareRoi,
     "Biases": Biases,
     "PixelMask": PixelMask,
+    "TriggerInput": TriggerInput,
     "Latency": Latency,
+    "TakesMarks": TakesMarks,
     "Closeable": Closeable,
 }
 _MIXINS: dict[str, type] = {
     "HardwareRoi": _WithHardwareRoi,
     "Biases": _WithBiases,
     "PixelMask": _WithPixelMask,
+    "TriggerInput": _WithTriggerInput,
     "Latency": _WithLatency,
+    "TakesMarks": _WithMarks,
     "Closeable": _WithClose,
 }
 

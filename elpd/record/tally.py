@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.events.epoch import EPOCH_STEP_US
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -18,9 +20,6 @@ if TYPE_CHECKING:
 
 SMALL_STEP_BACK_US = 64
 """Real streams step back by some microseconds; more is worth a warning."""
-
-EPOCH_STEP_US = 4096
-"""A TIME_LOW word has 12 bits: what steps back by more is not a late word but another epoch of the clock."""
 
 ODDITIES = {
     "padding": "padding words (0x9999)",

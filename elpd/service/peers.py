@@ -18,6 +18,9 @@ from elpd.errors import ConfigError
 SO_PEERGROUPS = 59
 """Linux's number (4.13), which Python's socket module does not name."""
 
+MOST_BYTES = 1024
+"""What Python's ``getsockopt`` takes at most: 256 groups."""
+
 
 @dataclass(frozen=True, slots=True)
 class Peer:
@@ -59,7 +62,7 @@ class Operators:
 
 def _further_groups(connection: socket.socket) -> tuple[int, ...]:
     try:
-        packed = connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, 1024)
+        packed = connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, MOST_BYTES)
     except OSError:
         return ()  # an older kernel, or more than 256 groups: the first one counts
     return struct.unpack(f"{len(packed) // 4}I", packed)

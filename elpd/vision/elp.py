@@ -28,7 +28,7 @@ from elpd.events.registers import (
     take_triggers,
 )
 from elpd.records import Encoding
-from elpd.vision import elp_addresses, elp_words
+from elpd.vision import elp_addresses, elp_lanes
 from elpd.vision.elp_weights import weight_table
 from elpd.vision.elp_windows import (
     CURSOR,
@@ -104,16 +104,16 @@ class ElpWindows:
         self._triggers = new_triggers()
         self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
-        self._pending = (np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64))
+        self._pending = elp_lanes.scratch()
         self._words = (
             {
-                Encoding.EVT3: elp_words.evt3_to_windows_capped,
+                Encoding.EVT3: elp_lanes.kernels()[1],
                 Encoding.EVT2: elp_addresses.evt2_to_windows_capped,
                 Encoding.EVT21: elp_addresses.evt21_to_windows_capped,
             }
             if rate_cap
             else {
-                Encoding.EVT3: elp_words.evt3_to_windows,
+                Encoding.EVT3: elp_lanes.kernels()[0],
                 Encoding.EVT2: elp_addresses.evt2_to_windows,
                 Encoding.EVT21: elp_addresses.evt21_to_windows,
             }
@@ -176,7 +176,7 @@ class ElpWindows:
             return self.feed_arrays(*event_columns(packet.data), complete_until_us=until_us)
         enter_epoch(packet, self._state)
         sum_words = self._words[packet.encoding]
-        scratch = (self._bucket, *self._pending) if packet.encoding is Encoding.EVT3 else (self._bucket,)
+        scratch = (self._bucket, *self._pending)
         words = packet.data
         window = self._window
         window[N_ROWS] = 0
@@ -202,14 +202,15 @@ class ElpWindows:
     ) -> NDArray[Any]:
         """Sum events given as columns of any stride, t int64 or uint32; return the windows closed, as ``feed``."""
         window = self._window
+        scratch = (self._bucket, *self._pending)
         window[N_ROWS] = 0
         position = self._arrays(
-            t, x, y, p, 0, self._table, window, self._edges, self._rows, complete_until_us, self._bucket
+            t, x, y, p, 0, self._table, window, self._edges, self._rows, complete_until_us, *scratch
         )
         while window[PAUSED]:
             self._make_room()
             position = self._arrays(
-                t, x, y, p, position, self._table, window, self._edges, self._rows, complete_until_us, self._bucket
+                t, x, y, p, position, self._table, window, self._edges, self._rows, complete_until_us, *scratch
             )
         return self._closed[: window[N_ROWS]]
 

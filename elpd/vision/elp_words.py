@@ -14,11 +14,11 @@ pipeline.)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.events.bits import trailing_zeros
+from elpd.events.bits import prefetch, trailing_zeros
 from elpd.events.evt3 import WORDS, skip_to_time, take_rare_words
 from elpd.events.jit import kernel
 from elpd.events.registers import HIGH, LOOP, LOW, MAX_SIDE, ROW, VECTOR_ON, VECTOR_X, Integer
@@ -85,13 +85,21 @@ def sum_pending(pending: NDArray[np.uint32], n: Integer, table: NDArray[np.int16
 @kernel()
 def sum_capped(
     pending: NDArray[np.uint32],
-    pending_us: NDArray[np.int64],
+    times: NDArray[Any],
+    first: int,
+    base_us: Integer,
     n: Integer,
     table: NDArray[np.int16],
     window: NDArray[np.int64],
     bucket: NDArray[np.int64],
 ) -> None:
-    """As ``sum_pending``, refusing the events of pixels that have had too many of late."""
+    """As ``sum_pending``, refusing the events of pixels that have had too many of late.
+
+    Event i was at ``base_us + times[first + i]``. The buckets of a sensor are larger than any cache that is near, so
+    they are all asked for first: without that an event took 18 ns on a dense recording, and 6 with.
+    """
+    for i in range(n):
+        prefetch(bucket, np.uint64(pending[i] >> np.uint32(1)))
     elp = np.int64(0)
     energy = np.int64(0)
     n_inside = np.int64(0)
@@ -104,7 +112,7 @@ def sum_capped(
             window[OUTSIDE] += 1
             window[OUT_OF_SENSOR] += weight == OUT_OF_SENSOR_WEIGHT
             continue
-        t = pending_us[i]
+        t = base_us + np.int64(times[first + i])
         ready = max(bucket[index], t)
         if ready - t > DEPTH_US:
             n_capped += 1
@@ -134,7 +142,7 @@ def sum_block(
 ) -> None:
     """Add the *n* events of a block to the open window."""
     if capped:
-        sum_capped(pending, pending_us, n, table, window, bucket)
+        sum_capped(pending, pending_us, 0, 0, n, table, window, bucket)
     else:
         sum_pending(pending, n, table, window)
 

@@ -23,12 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import UsageError
+from elpd.events.bits import prefetch
 from elpd.events.jit import kernel
 from elpd.events.stream import PacketDecoder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from elpd.events.registers import Integer
     from elpd.records import CameraPacket, Geometry
 
 SLOTS = 3
@@ -60,11 +62,14 @@ UNFIRED = np.uint8(SLOTS + 1)
 
 N_ON, N_BEFORE, N_AFTER, N_OUTSIDE = range(4)
 
+LISTED = 512
+"""Events listed at a time."""
+
 
 @kernel(
     'void(Array(int64, 1, "C", readonly=True), Array(uint16, 1, "C", readonly=True),'
     ' Array(uint16, 1, "C", readonly=True), Array(uint8, 1, "C", readonly=True), int64, int64, int64, int64,'
-    " int32[:, ::1], uint16[::1], int64[::1])"
+    " int32[:, ::1], uint16[::1], int64[::1], int64[:, ::1])"
 )
 def latch_first_on(
     t_us: NDArray[np.int64],
@@ -78,34 +83,46 @@ def latch_first_on(
     slots: NDArray[np.int32],
     before: NDArray[np.uint16],
     tally: NDArray[np.int64],
+    listed: NDArray[np.int64],
 ) -> None:
-    """Add events to *slots* (3, height*width) and count the ON events *before* the interval, saturating."""
-    n_on = n_before = n_after = n_outside = 0
-    for i in range(t_us.size):
-        if on[i] != 1:
-            continue
-        column = np.int64(x[i])
-        row = np.int64(y[i])
-        if column >= width or row >= height:
-            n_outside += 1
-            continue
-        k = row * width + column
-        t = t_us[i]
-        if t < begin_us:
-            n_before += 1
-            if before[k] < 65535:
-                before[k] += np.uint16(1)
-        elif t >= end_us:
-            n_after += 1
-        else:
-            n_on += 1
-            time = np.int32(t - begin_us)
-            if slots[0, k] == EMPTY:
-                slots[0, k] = time
-            elif slots[1, k] == EMPTY:
-                slots[1, k] = time
-            elif slots[2, k] == EMPTY:
-                slots[2, k] = time
+    """Add events to *slots* (3, height*width) and count the ON events *before* the interval, saturating.
+
+    In two steps over some events: those that count are listed (pixel and time in the rows of *listed*) without a branch
+    on their polarity, which nobody can predict, and their pixels asked for, which no near cache holds; then latched.
+    """
+    n_on = n_before = n_after = 0
+    n_outside: Integer = 0
+    room = listed.shape[1]
+    begun = 0
+    while begun < t_us.size:
+        until = min(begun + room, t_us.size)
+        n: Integer = 0
+        for i in range(begun, until):
+            is_on = np.int64(on[i] == 1)
+            inside = np.int64(x[i] < width) & np.int64(y[i] < height)
+            k = np.int64(y[i]) * width + np.int64(x[i])
+            listed[0, n], listed[1, n] = k, t_us[i]
+            prefetch(slots, k)
+            n += is_on & inside
+            n_outside += is_on & ~inside & 1
+        begun = until
+        for i in range(n):
+            k, t = listed[0, i], listed[1, i]
+            if t < begin_us:
+                n_before += 1
+                if before[k] < 65535:
+                    before[k] += np.uint16(1)
+            elif t >= end_us:
+                n_after += 1
+            else:
+                n_on += 1
+                time = np.int32(t - begin_us)
+                if slots[0, k] == EMPTY:
+                    slots[0, k] = time
+                elif slots[1, k] == EMPTY:
+                    slots[1, k] = time
+                elif slots[2, k] == EMPTY:
+                    slots[2, k] = time
     tally[N_ON] += n_on
     tally[N_BEFORE] += n_before
     tally[N_AFTER] += n_after
@@ -124,7 +141,7 @@ def sort_few(values: NDArray[np.int32], count: int) -> None:
         values[j] = value
 
 
-@kernel("int64(int32[:, ::1], uint8[:, ::1], int32[:, ::1], uint8[:, ::1], int32[:, :, ::1], float64)")
+@kernel("int64(int32[:, ::1], uint8[:, ::1], int32[:, ::1], uint8[:, ::1], int32[:, :, ::1], float64)", allocates=True)
 def believe(
     times: NDArray[np.int32],
     choice: NDArray[np.uint8],
@@ -239,6 +256,7 @@ class FirstEventMap:
         self._slots = np.full((SLOTS, geometry.height, geometry.width), EMPTY, np.int32)
         self._before = np.zeros((geometry.height, geometry.width), np.uint16)
         self._tally = np.zeros(4, np.int64)
+        self._listed = np.empty((2, LISTED), np.int64)
         self._decoder: PacketDecoder | None = None
         self.first_us: int | None = None
         self.last_us: int | None = None
@@ -313,6 +331,7 @@ class FirstEventMap:
             self._slots.reshape(SLOTS, -1),
             self._before.reshape(-1),
             self._tally,
+            self._listed,
         )
 
     def raw_times_us(self) -> NDArray[np.int32]:

@@ -6,18 +6,22 @@ cancel have a connection of their own, so that nothing ever queues before them.
 
 from __future__ import annotations
 
-import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from elpd.web.link import DaemonError, Link
+from elpd.client.aio import AsyncClient
+from elpd.errors import BusyError, ElpdError, UnreachableError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 URGENT = frozenset({"stop", "cancel"})
 COMMANDS = URGENT | {"focus", "home", "move", "jog", "clear", "roi", "preset", "mode", "temperature", "record"}
-QUESTIONS = frozenset({"hello", "status", "runs", "run", "map", "metrics", "roi", "mode"})
-"""What a GET may ask; ``roi`` and ``mode`` without parameters only read."""
+QUESTIONS = frozenset({"hello", "status", "runs", "run", "map", "metrics", "roi", "mode", "presets"})
+"""What a GET may ask. ``roi`` and ``mode`` without parameters only read; ``presets`` is the list of ``preset``."""
+
+AUTO = ("frame", "map")
+"""What somebody who draws a region wants to see; the newest of what there is, if there is neither."""
 
 IN_FLIGHT = 6
 """The daemon allows eight requests in flight on a connection."""
@@ -30,57 +34,66 @@ STATUS_OF = {
     "Fault": 423,
     "UsageError": 400,
     "ConfigError": 400,
-    "FormatError": 400,
     "TooLarge": 413,
+    "DeviceError": 502,
     "LensError": 502,
     "CameraError": 502,
-    "DeviceError": 502,
     "Unavailable": 503,
-    "TooMany": 429,
-    "Timeout": 504,
+    "Unreachable": 503,
 }
-"""HTTP status of each kind of error; 500 for a kind that a newer daemon may have."""
+"""HTTP status of each kind of error; 500 for one that is not listed."""
+
+
+def kind_of(error: ElpdError) -> str:
+    """Return the socket's word for an error."""
+    return error.kind.removesuffix("Error") if isinstance(error, BusyError) else error.kind
 
 
 class Desk:
     """Carries requests to the daemon."""
 
-    def __init__(self, socket: Path) -> None:
-        self._ordinary = Link(socket)
-        self._looking = Link(socket)
-        self._urgent = Link(socket)
+    def __init__(self, daemon: Path) -> None:
+        self._ordinary = AsyncClient(daemon)
+        self._looking = AsyncClient(daemon)
+        self._urgent = AsyncClient(daemon, timeout_s=URGENT_WITHIN_S)
         self._in_flight = {"command": 0, "question": 0}
 
     async def command(self, method: str, params: dict[str, Any]) -> Any:
-        """Ask for something that may move the lens. Raises ``DaemonError``."""
+        """Ask for something that may move the lens. Raises ``ElpdError``."""
         if method in URGENT:
             return await self._now(method, params)
         return await self._counted("command", self._ordinary, method, params)
 
     async def question(self, method: str, params: dict[str, Any]) -> Any:
-        """Ask for something that only reads: a slow answer never stands before a command. Raises ``DaemonError``."""
+        """Ask for something that only reads: a slow answer never stands before a command. Raises ``ElpdError``."""
         return await self._counted("question", self._looking, method, params)
+
+    async def picture(self, params: dict[str, Any]) -> Any:
+        """Ask for a picture; the kind ``auto`` is the first of those that there are. Raises ``ElpdError``."""
+        if params.get("kind") == "auto":
+            for kind in AUTO:
+                with suppress(UsageError):
+                    return await self.question("map", params | {"kind": kind})
+            params = params | {"kind": "latest"}
+        return await self.question("map", params)
 
     async def close(self) -> None:
         """Hang up."""
-        for link in (self._ordinary, self._looking, self._urgent):
-            await link.close()
+        for client in (self._ordinary, self._looking, self._urgent):
+            await client.close()
 
-    async def _counted(self, side: str, link: Link, method: str, params: dict[str, Any]) -> Any:
+    async def _counted(self, side: str, client: AsyncClient, method: str, params: dict[str, Any]) -> Any:
         if self._in_flight[side] >= IN_FLIGHT:
-            raise DaemonError("TooMany", f"{IN_FLIGHT} requests are still unanswered; wait for them")
+            raise BusyError(f"{IN_FLIGHT} requests of the page are still unanswered; wait for them")
         self._in_flight[side] += 1
         try:
-            return await link.call(method, params)
+            return await client.call(method, params)
         finally:
             self._in_flight[side] -= 1
 
     async def _now(self, method: str, params: dict[str, Any]) -> Any:
         try:
-            async with asyncio.timeout(URGENT_WITHIN_S):
-                return await self._urgent.call(method, params)
-        except TimeoutError:
+            return await self._urgent.call(method, params)
+        except UnreachableError as error:
             await self._urgent.close()  # the next one gets a fresh connection
-            raise DaemonError(
-                "Timeout", f"the daemon has not answered {method} for {URGENT_WITHIN_S:g} s; use the rig's own switch"
-            ) from None
+            raise UnreachableError(f"{error}; use the rig's own switch if anything moves") from None

@@ -2,7 +2,8 @@
 
 ==============================  =================================================================================
 ``GET /`` and the page's files  open to whoever reaches the port; they hold no secret
-``GET /api/METHOD?name=value``  a question; ``map`` answers with the picture itself, ``metrics`` with text
+``GET /api/METHOD?name=value``  a question; ``map`` answers with the picture itself, ``metrics`` with text; ``map``
+                                also knows ``kind=auto``
 ``GET /api/events``             server-sent events: ``link reset status sample phase result fault state position
                                 dropped``; resumes after ``Last-Event-ID``
 ``POST /api/METHOD``            a command; the body holds its parameters
@@ -23,9 +24,9 @@ from typing import TYPE_CHECKING, Any
 import structlog
 from aiohttp import web
 
+from elpd.errors import ElpdError
 from elpd.web import pages
-from elpd.web.commands import COMMANDS, QUESTIONS, STATUS_OF, Desk
-from elpd.web.link import DaemonError
+from elpd.web.commands import COMMANDS, QUESTIONS, STATUS_OF, Desk, kind_of
 from elpd.web.relay import Relay
 from elpd.web.security import HEADERS, Gate
 
@@ -87,8 +88,9 @@ async def _judge(
         return _error(refusal.status, "Refused", refusal.message)
     try:
         return await handler(request)
-    except DaemonError as error:
-        return _error(STATUS_OF.get(error.kind, 500), error.kind, str(error))
+    except ElpdError as error:
+        kind = kind_of(error)
+        return _error(STATUS_OF.get(kind, 500), kind, str(error))
     except web.HTTPException as error:
         return _error(error.status, "UsageError", error.text or error.reason)
 
@@ -128,9 +130,10 @@ async def _question(request: web.Request) -> web.StreamResponse:
         return _error(404, "UsageError", f"there is no question {method!r}; there are {', '.join(sorted(QUESTIONS))}")
     if method in COMMANDS and request.query:
         return _error(405, "UsageError", f"{method} with parameters is a command; commands are sent with POST")
-    answer = await request.app[DESK].question(method, _query(request))
     if method == "map":
-        return _picture(answer)
+        return _picture(await request.app[DESK].picture(_query(request)))
+    asked = ("preset", {"action": "list"}) if method == "presets" else (method, _query(request))
+    answer = await request.app[DESK].question(*asked)
     if method == "metrics":
         return web.Response(text=answer["text"], content_type="text/plain")
     return web.json_response(answer)
@@ -154,7 +157,7 @@ async def _events(request: web.Request) -> web.StreamResponse:
     """Stream to one tab: many small events go out together, thirty times a second at most."""
     relay, streams = request.app[RELAY], request.app[STREAMS]
     if relay.tabs >= MAX_TABS:
-        return _error(503, "TooMany", f"{MAX_TABS} pages are open already; close some")
+        return _error(503, "Busy", f"{MAX_TABS} pages are open already; close some")
     response = web.StreamResponse(headers={"Content-Type": "text/event-stream", "X-Accel-Buffering": "no"})
     tab = relay.join(request.headers.get("Last-Event-ID"))
     task = asyncio.current_task()

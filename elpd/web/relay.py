@@ -11,18 +11,20 @@ samples, is told how many, and costs nobody else anything.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import secrets
 from collections import deque
+from contextlib import aclosing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import structlog
 
-from elpd.web.link import Connection, DaemonError
+from elpd.client.aio import AsyncClient
+from elpd.errors import ElpdError
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine, Mapping
     from pathlib import Path
 
 RING_EVENTS = 4096
@@ -31,7 +33,6 @@ TAB_EVENTS = 1024
 SAMPLE_RATE_HZ = 200
 """A cycle may take a fifth of a second; a curve needs some tens of points."""
 STATUS_EVERY_S = 0.5
-ANSWER_WITHIN_S = 5.0
 RETRY_FIRST_S, RETRY_LAST_S = 0.25, 5.0
 
 log = structlog.get_logger(__name__)
@@ -69,8 +70,8 @@ class Tab:
 class Relay:
     """The telemetry side of the gateway."""
 
-    def __init__(self, socket: Path) -> None:
-        self._socket = socket
+    def __init__(self, daemon: Path) -> None:
+        self._daemon = daemon
         self._epoch = secrets.token_hex(4)
         self._ring: deque[tuple[int, bool, bytes]] = deque(maxlen=RING_EVENTS)
         self._last = 0
@@ -112,52 +113,36 @@ class Relay:
         """Keep the subscription, for ever: connect, listen, ask for the status; wait a little longer each time."""
         retry_s = RETRY_FIRST_S
         while True:
-            try:
-                async with asyncio.timeout(ANSWER_WITHIN_S):
-                    connection = await self._connect()
-                retry_s = RETRY_FIRST_S
-                await self._watch(connection)
-                reason = "the daemon hung up"
-            except DaemonError as error:
-                reason = str(error)
-            except TimeoutError:
-                reason = f"the daemon has not answered for {ANSWER_WITHIN_S:g} s; look at its log"
-            self._tell_link({"connected": False, "reason": reason, "retry_s": retry_s})
+            async with AsyncClient(self._daemon) as client:
+                try:
+                    hello = await client.hello()
+                    retry_s = RETRY_FIRST_S
+                    self._in_cycle = False
+                    self._tell_link({"connected": True, "role": hello["role"], "version": hello["version"]})
+                    await _until_one_fails(self._listen(client), self._watch(client))
+                except ElpdError as error:
+                    self._tell_link({"connected": False, "reason": str(error), "retry_s": retry_s})
             await asyncio.sleep(retry_s)
             retry_s = min(2 * retry_s, RETRY_LAST_S)
 
-    async def _connect(self) -> Connection:
-        connection = await Connection.open(self._socket, self._hear)
-        try:
-            hello = await connection.call("hello")
-            await connection.call("subscribe", {"rate_hz": SAMPLE_RATE_HZ})
-        except BaseException:
-            await connection.close()
-            raise
-        self._in_cycle = False
-        self._tell_link({"connected": True, "role": hello["role"], "version": hello["version"]})
-        return connection
+    async def _listen(self, client: AsyncClient) -> None:
+        """Hear events until the daemon goes, which raises."""
+        async with aclosing(client.events(rate_hz=SAMPLE_RATE_HZ)) as events:
+            async for event in events:
+                self._hear(event)
 
-    async def _watch(self, connection: Connection) -> None:
-        """Ask for the status as long as the connection lasts."""
-        try:
-            while not connection.closed.is_set():
-                async with asyncio.timeout(ANSWER_WITHIN_S):
-                    self._status = message_bytes("status", await connection.call("status"))
-                for tab in self._tabs:
-                    tab.put(self._status)
-                await _first_of(connection.closed.wait(), self._pause())
-        finally:
-            await connection.close()
+    async def _watch(self, client: AsyncClient) -> None:
+        """Ask for the status for as long as somebody looks; a daemon that does not answer raises."""
+        while True:
+            self._status = message_bytes("status", await client.call("status"))
+            for tab in self._tabs:
+                tab.put(self._status)
+            await asyncio.sleep(STATUS_EVERY_S)
+            await self._wanted.wait()
 
-    async def _pause(self) -> None:
-        """Let half a second pass, then wait until somebody watches."""
-        await asyncio.sleep(STATUS_EVERY_S)
-        await self._wanted.wait()
-
-    def _hear(self, event: dict[str, Any]) -> None:
+    def _hear(self, event: Mapping[str, Any]) -> None:
         kind = str(event["event"])
-        if kind == "phase" and not self._in_cycle:
+        if kind == "phase" and not self._in_cycle and event.get("phase") not in {"idle", "done"}:
             self._in_cycle, self._cycle_from = True, self._last + 1
         elif kind == "result":
             self._in_cycle = False
@@ -195,13 +180,15 @@ def message_bytes(kind: str, fields: dict[str, Any], number: str | None = None) 
     return f"{head}event: {kind}\ndata: {json.dumps(fields, separators=(',', ':'))}\n\n".encode()
 
 
-async def _first_of(*waits: Any) -> None:
-    """Wait for whichever comes first; end the others."""
-    tasks = [asyncio.ensure_future(wait) for wait in waits]
+async def _until_one_fails(*works: Coroutine[Any, Any, None]) -> None:
+    """Do all until one ends, end the others, and raise what it raised."""
+    tasks = [asyncio.ensure_future(work) for work in works]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        outcomes = await asyncio.gather(*tasks, return_exceptions=True)
+    for outcome in outcomes:
+        if isinstance(outcome, Exception):
+            raise outcome

@@ -45,7 +45,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """What is let in: *hosts* as they stand in a ``Host`` header, lower case, with the port where it is not 80 or 443."""
+    """What is let in: *hosts* as they stand in a ``Host`` header (lower case, port included)."""
 
     hosts: frozenset[str]
     token: str

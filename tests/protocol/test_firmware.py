@@ -100,6 +100,22 @@ def test_sync_makes_an_edge_every_so_many_steps() -> None:
     assert bench.board.sync_edges - before == 10
 
 
+def test_sync_marks_the_same_places_from_either_side() -> None:
+    bench = Bench(sync_steps=50)
+    bench.ask(wire.GO, wire.go(2130, 8000))
+    bench.live(150)
+    bench.board.take_sync_edges()
+    marks = []
+    for target in (2310, 1985, 2025):
+        bench.ask(wire.GO, wire.go(target, 4000))
+        for _ in range(1500):
+            before = bench.board.pin_position
+            bench.live(0.1)
+            marks += [(before, bench.board.pin_position)] * len(bench.board.take_sync_edges())
+    places = [next(at for at in range(min(way) - 1, max(way) + 2) if at % 50 == 0) for way in marks]
+    assert places == [2150, 2200, 2250, 2300, 2300, 2250, 2200, 2150, 2100, 2050, 2000, 2000]
+
+
 def test_the_iris_pin_follows_its_command() -> None:
     bench = Bench()
     for wanted in (True, False):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,7 @@ import pytest
 import serial
 import ticlib
 from elpd_drivers.lenses.serial_port import SerialPort
-from elpd_drivers.sim.boards.line import PtyServer
+from elpd_drivers.sim.boards.line import TIOCGEXCL, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
 from lens_rigs import DIALECTS, KINDS, SPEED_SPS, needs, served
 from virtual import MonotonicClock
@@ -94,6 +96,29 @@ def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(kind: str, 
     assert motor.rotor_at(CLOCK.now_ns()) == 3200.0
     lens.close()
     open_lens(kind, server.port).close()
+
+
+@pytest.mark.parametrize("kind", ["tic"])
+def test_a_program_that_was_killed_keeps_nobody_from_the_port(board: Any) -> None:
+    server, _ = board
+
+    def marked_as_exclusive(descriptor: int) -> bool:
+        return fcntl.ioctl(descriptor, TIOCGEXCL, bytes(4)) != bytes(4)
+
+    watching = os.open(server.port, os.O_RDWR | os.O_NOCTTY)
+    killed = os.open(server.port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        fcntl.flock(killed, fcntl.LOCK_EX)
+        fcntl.ioctl(killed, termios.TIOCEXCL)
+        CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 300))
+        assert marked_as_exclusive(watching)  # as long as it lives the mark is respected
+        os.close(killed)  # as the kernel does it: nobody takes the mark back
+        end = after_ms(CLOCK.now_ns(), 20_000)
+        while marked_as_exclusive(watching) and CLOCK.now_ns() < end:
+            CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 10))
+        assert not marked_as_exclusive(watching)
+    finally:
+        os.close(watching)
 
 
 def test_unplugging_is_an_error_that_says_so(kind: str, board: Any) -> None:

@@ -14,13 +14,13 @@ from click.testing import CliRunner
 from elpd import rig
 from elpd.cli import detect as detect_command
 from elpd.cli import replay as replay_command
-from elpd.record.session import focus_once
 from elpd.config import Config
 from elpd.focus.cycle import FocusCycle
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.record.journal import RunWriter
 from elpd.record.replay import load_run, replay_run
 from elpd.record.run_sweep import read_run_sweep
+from elpd.record.session import focus_once
 from elpd.record.tape import open_file
 from elpd.records import Outcome
 from elpd.vision.ruler import Ruler

@@ -9,7 +9,6 @@ from click.testing import CliRunner
 
 from elpd.cli import check, inspection
 from elpd.cli.inspection import Finding, Status
-from elpd.ports import FoundDevice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -155,47 +154,3 @@ def test_the_command_answers_people_and_programs(monkeypatch: pytest.MonkeyPatch
     assert answer["self_test"][0]["outcome"] == "FOCUSED"
     broken = next(item for item in answer["drivers"] if item["driver"] == "strange_broken")
     assert broken["error"] == "RuntimeError: firmware of another century"
-
-
-def test_serial_ports_and_cameras_are_looked_for_without_being_opened(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import types  # noqa: PLC0415
-
-    import usb.core  # noqa: PLC0415
-    from elpd_drivers import discovery  # noqa: PLC0415
-    from serial.tools import list_ports  # noqa: PLC0415
-
-    from elpd.errors import DeviceError  # noqa: PLC0415
-
-    (tmp_path / "ttyUSB0").touch()
-    ports = [
-        types.SimpleNamespace(device=str(tmp_path / name), name=name, description=text, hwid=hwid)
-        for name, text, hwid in (
-            ("ttyUSB1", "n/a", "USB VID:PID=1FFB:00B3"),
-            ("ttyS0", "n/a", "n/a"),
-            ("ttyUSB0", "Arduino Uno", "USB VID:PID=2341:0043"),
-        )
-    ]
-    monkeypatch.setattr(list_ports, "comports", lambda: ports)
-    first, second = discovery.serial_ports()
-    assert first == FoundDevice("serial port", "Arduino Uno", str(tmp_path / "ttyUSB0"))
-    assert (second.name, second.next_step is None) == ("ttyUSB1", False)
-
-    bus = [
-        types.SimpleNamespace(idVendor=vendor, idProduct=product, bus=999, address=7)
-        for vendor, product in ((0x04B4, 0x00F5), (0x1D6B, 2), (0x152A, 0x841A))
-    ]
-    monkeypatch.setattr(usb.core, "find", lambda **_: iter(bus))
-    evk4, davis = discovery.usb_cameras()
-    assert (evk4.name, evk4.where) == ("Prophesee EVK4 or EVK3 HD (04b4:00f5)", "/dev/bus/usb/999/007")
-    assert evk4.next_step is not None
-    assert 'ATTRS{idVendor}=="04b4"' in evk4.next_step
-    assert davis.name == "iniVation DAVIS or DVXplorer (152a:841a)"
-
-    def no_libusb(**_: object) -> object:
-        raise usb.core.NoBackendError("No backend available")
-
-    monkeypatch.setattr(usb.core, "find", no_libusb)
-    with pytest.raises(DeviceError, match="install it to find USB cameras"):
-        discovery.usb_cameras()

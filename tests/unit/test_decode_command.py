@@ -97,7 +97,7 @@ def test_events_that_the_rate_controller_dropped_are_lost(run: Any, tmp_path: Pa
         ("missing.raw", None, "cannot be read"),
         ("empty.raw", b"", "is empty"),
         ("notes.txt", b"focus was at 12 mm\n", "no format that is installed here"),
-        ("davis.aedat4", b"#!AER-DAT4.0\r\n\x00\x00", "RAW (EVT2, EVT2.1, EVT3)"),
+        ("davis.aedat", b"#!AER-DAT2.0\r\n\x00\x00", "RAW (EVT2, EVT2.1, EVT3)"),
         ("cut.dat", b"% Data file containing CD events.\n% Version 2\n\x00", "NPY, NPZ"),
         ("later.raw", b"% evt 4.0\n% end\n", "'4.0'"),
     ],

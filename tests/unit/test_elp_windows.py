@@ -8,15 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from streams import cuts, evt2_words, evt3_words, evt21_words, pieces, sizes
+from streams import cuts, evt2_words, evt3_stream, evt3_words, evt21_words, long_cuts, needs_lanes, pieces, seeds, sizes
 
 from elpd.errors import UsageError
 from elpd.events.evt3_encode import Evt3Encoder
-from elpd.events.registers import new_state, new_triggers
+from elpd.events.evt3_lanes import LISTS
+from elpd.events.registers import new_state
 from elpd.records import CameraPacket, Encoding
-from elpd.vision import elp_words
+from elpd.vision import elp_lanes, elp_words
 from elpd.vision.elp import ElpWindows
-from elpd.vision.elp_weights import weight_table
+from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, STRIDE
 from elpd.vision.elp_windows import NEVER, new_window
 
 WORDS = {
@@ -24,7 +25,6 @@ WORDS = {
     Encoding.EVT2: (naive.decode_evt2, np.uint32),
     Encoding.EVT21: (naive.decode_evt21, np.uint64),
 }
-seeds = st.integers(0, 2**32 - 1)
 edge_steps = st.lists(st.integers(1, 5000), max_size=40)
 DTYPES = {
     "neuromorphic-drivers, packed 13 bytes": [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")],
@@ -71,6 +71,7 @@ def assert_words_equal_twin(
     seed: int,
     *,
     rate_cap: bool,
+    kernel: Any = None,
 ) -> None:
     twin, dtype = WORDS[encoding]
     words = np.array(words, dtype)
@@ -79,6 +80,8 @@ def assert_words_equal_twin(
     begin = min((item[1] for item in items), default=0) + seed % 3000 - 1000
     edges = edges_from(begin, steps)
     meter = ElpWindows(weights, inside, rate_cap=rate_cap)
+    if kernel is not None:
+        meter._words[encoding] = kernel
     meter.extend_edges(edges)
     rows = feed_all(meter, encoding, words, cuts)
     expected, nowhere = naive.elp_windows(items, weights, inside, edges, rate_cap=rate_cap)
@@ -93,7 +96,46 @@ def assert_words_equal_twin(
 def test_evt3_windows_equal_the_twin(
     *, words: list[int], width: int, height: int, cuts: list[int], steps: list[int], seed: int, rate_cap: bool
 ) -> None:
+    scalar = (elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped)[rate_cap]
+    assert_words_equal_twin(Encoding.EVT3, words, width, height, cuts, steps, seed, rate_cap=rate_cap, kernel=scalar)
+
+
+@needs_lanes
+@settings(max_examples=300)
+@given(
+    words=evt3_words(), width=sizes, height=sizes, cuts=cuts, steps=edge_steps, seed=seeds, rate_cap=st.booleans()
+)  # fmt: skip
+def test_evt3_windows_by_blocks_equal_the_twin(
+    *, words: list[int], width: int, height: int, cuts: list[int], steps: list[int], seed: int, rate_cap: bool
+) -> None:
+    words = np.concatenate([np.array(words, np.uint16), evt3_stream(seed, 300, width, height)])
     assert_words_equal_twin(Encoding.EVT3, words, width, height, cuts, steps, seed, rate_cap=rate_cap)
+
+
+@needs_lanes
+@settings(max_examples=100)
+@given(
+    seed=seeds, width=st.integers(1, 2048), height=st.integers(1, 200), cuts=long_cuts, window_us=st.integers(1, 9000),
+    rate_cap=st.booleans(), open_ended=st.booleans(),
+)  # fmt: skip
+def test_long_streams_sum_by_blocks_as_word_by_word(
+    *, seed: int, width: int, height: int, cuts: list[int], window_us: int, rate_cap: bool, open_ended: bool
+) -> None:
+    weights = np.random.default_rng(seed).integers(-32766, 32767, (height, width))
+    inside = weights % 5 != 0
+    inside[0, 0] = True
+    words = evt3_stream(seed, 4000, width, height)
+    slow, fast = (
+        ElpWindows(weights, inside, window_us=None if open_ended else window_us, rate_cap=rate_cap) for _ in range(2)
+    )
+    slow._words[Encoding.EVT3] = (elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped)[rate_cap]
+    if open_ended:
+        for meter in (slow, fast):
+            meter.extend_edges([4096 + window_us * step for step in range(3)])
+    assert feed_all(slow, Encoding.EVT3, words, []) == feed_all(fast, Encoding.EVT3, words, cuts)
+    assert slow.counters == fast.counters
+    assert slow._state.tolist() == fast._state.tolist()
+    assert (slow._bucket == fast._bucket).all()
 
 
 @settings(max_examples=300)
@@ -263,23 +305,51 @@ def test_words_and_arrays_of_the_same_events_give_the_same_windows() -> None:
     )
 
 
+def guarded(size: int, dtype: Any) -> tuple[Any, Any]:
+    """An array, and the larger one of a known value that it lies in."""
+    around = np.full(size + 128, 77, dtype)
+    return around[64 : 64 + size], around
+
+
+@pytest.mark.parametrize("capped", [False, True])
+@pytest.mark.parametrize("scalar", [False, True])
 @settings(max_examples=40)
-@given(st.integers(0, 2**32 - 1), st.integers(0, 6), st.integers(2, 6))
-def test_no_stream_writes_outside_rows_nor_reads_outside_the_table(seed: int, n_rows: int, n_edges: int) -> None:
-    words = np.random.default_rng(seed).integers(0, 0xFFFF, 500, np.uint16, endpoint=True)
-    rows = np.full((n_rows + 8, 7), 123, np.int64)
-    edges = np.full(n_edges + 8, 10**15)
-    edges[4 : 4 + n_edges] = np.arange(n_edges) * 1_000_000
-    window = new_window()
+@given(seed=seeds, n_rows=st.integers(0, 6), n_edges=st.integers(2, 6), height=st.integers(0, 3))
+def test_no_stream_touches_anything_but_its_own(
+    *, seed: int, n_rows: int, n_edges: int, height: int, scalar: bool, capped: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    words = rng.integers(0, 0xFFFF, 3000, np.uint16, endpoint=True)
+    if seed % 2:  # as many events as words can hold
+        words[rng.random(3000) < 0.97] = 0x4FFF
+    sizes = {
+        "rows": 7 * n_rows,
+        "edges": n_edges,
+        "window": 18,
+        "state": 24,
+        "triggers": 3,
+        "ledger": elp_words.PENDING,
+    }
+    arrays = {name: guarded(size, np.int64) for name, size in sizes.items()}
+    table, around_table = guarded((height + 1) * STRIDE, np.int16)
+    table[:] = OUT_OF_SENSOR_WEIGHT
+    around_table[:64] = around_table[-64:] = 30000  # a weight: read, it would show
+    bucket, around_bucket = guarded(table.size, np.int64)
+    lists, around_lists = guarded(LISTS, np.uint32)
+    window, state, edges = (arrays[name][0] for name in ("window", "state", "edges"))
+    window[:], state[:] = new_window(), new_state()
+    edges[:] = np.arange(n_edges) * 1_000_000
     window[6], window[15] = n_edges, 1
-    # A table without a pad: any index beyond it would fault or hit the allocator's guard in a debug build.
-    table = weight_table(np.ones((1, 1), np.int64))
-    elp_words.evt3_to_windows(
-        words, 0, new_state(), new_triggers(), table, window, edges[4 : 4 + n_edges], rows[4 : 4 + n_rows], NEVER,
-        np.zeros(1, np.int64), np.zeros(elp_words.PENDING, np.uint32), np.zeros(elp_words.PENDING, np.int64),
+    kernels = (elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped) if scalar else elp_lanes.kernels()
+    kernels[capped](
+        words, 0, state, arrays["triggers"][0].reshape(1, 3), table, window, edges, arrays["rows"][0].reshape(-1, 7),
+        NEVER, bucket, lists, arrays["ledger"][0],
     )  # fmt: skip
-    assert (rows[:4] == 123).all()
-    assert (rows[4 + n_rows :] == 123).all()
+    assert window[0] == window[1] == 0
+    for _, around in (*arrays.values(), (bucket, around_bucket), (lists, around_lists)):
+        assert (around[:64] == 77).all()
+        assert (around[-64:] == 77).all()
+    assert (bucket == 77).all()
 
 
 @pytest.mark.parametrize(

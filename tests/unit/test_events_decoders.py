@@ -7,20 +7,27 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from streams import cuts, evt2_words, evt3_words, evt21_words, pieces, sizes
+from streams import cuts, evt2_words, evt3_stream, evt3_words, evt21_words, long_cuts, needs_lanes, pieces, seeds, sizes
 
 from elpd.errors import UsageError
 from elpd.events import evt2, evt3
 from elpd.events.evt2 import Evt2Decoder, Evt21Decoder, swap_halves
 from elpd.events.evt3 import Evt3Decoder
+from elpd.events.evt3_fast import Evt3BlockDecoder
+from elpd.events.lanes import available
 from elpd.events.registers import new_state, new_triggers
 from elpd.records import Geometry, Trigger
 
 CODECS = {
     "evt3": (Evt3Decoder, naive.decode_evt3, np.uint16),
+    "evt3 by blocks": (Evt3BlockDecoder, naive.decode_evt3, np.uint16),
     "evt2": (Evt2Decoder, naive.decode_evt2, np.uint32),
     "evt21": (Evt21Decoder, naive.decode_evt21, np.uint64),
 }
+
+
+if not available():
+    del CODECS["evt3 by blocks"]
 
 
 def feed_all(decoder: Any, words: Any, cuts: list[int]) -> Any:
@@ -48,6 +55,26 @@ def assert_equals_twin(codec: str, words: Any, width: int, height: int, cuts: li
 @given(evt3_words(), sizes, sizes, cuts)
 def test_evt3_equals_its_twin_for_any_words_and_cuts(words: Any, width: int, height: int, cuts: list[int]) -> None:
     assert_equals_twin("evt3", words, width, height, cuts)
+
+
+@needs_lanes
+@settings(max_examples=300)
+@given(words=evt3_words(), seed=seeds, width=sizes, height=sizes, cuts=cuts)
+def test_evt3_by_blocks_equals_the_twin(words: Any, seed: int, width: int, height: int, cuts: list[int]) -> None:
+    words = np.concatenate([np.array(words, np.uint16), evt3_stream(seed, 300, width, height)])
+    assert_equals_twin("evt3 by blocks", words, width, height, cuts)
+
+
+@needs_lanes
+@settings(max_examples=60)
+@given(seed=seeds, width=st.integers(1, 2048), height=st.integers(1, 2048), cuts=long_cuts)
+def test_long_streams_decode_by_blocks_as_word_by_word(seed: int, width: int, height: int, cuts: list[int]) -> None:
+    geometry = Geometry(width, height)
+    words = evt3_stream(seed, 4000, width, height)
+    slow, fast = Evt3Decoder(geometry), Evt3BlockDecoder(geometry)
+    for one, other in zip(feed_all(slow, words, [])[0], feed_all(fast, words, cuts)[0], strict=True):
+        assert (one == other).all()
+    assert slow._state.tolist() == fast._state.tolist()
 
 
 @settings(max_examples=300)

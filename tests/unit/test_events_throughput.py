@@ -20,7 +20,7 @@ RATIOS = {
 def test_json_has_rows_and_ratios_or_the_reason_why_not() -> None:
     command = [sys.executable, TOOL, RECORDINGS / "gen41_dense_vectors.raw", "--json", "--rounds", "1", "--mb", "1"]
     answer = json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
-    assert {"name", "mb_s", "mev_s"} == set(answer["rows"][0])
+    assert {"name", "file", "mb_s", "mev_s"} == set(answer["rows"][0])
     assert set(answer["ratios"]) >= RATIOS
     assert all(ratio is not None or answer["reasons"][name] for name, ratio in answer["ratios"].items())
 

@@ -2,15 +2,17 @@
 
 import functools
 import operator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from elpd_drivers.formats import npy, raw
+from event_files import GEOMETRY, event_columns, packet, read_all, write_all
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import opened, read_columns
+from streams import cuts, opened, read_columns
 
 from elpd.errors import FormatError
 from elpd.events.evt3_encode import Evt3Encoder
@@ -175,6 +177,25 @@ def test_a_numpy_file_cut_short_at_any_byte_is_an_error_or_refused(tmp_path: Pat
         path.write_bytes(whole[:size])
         with pytest.raises(FormatError):
             read_columns(path)
+
+
+@given(word=st.sampled_from(["npy", "npz"]), columns=event_columns(), cuts=cuts, chunk=st.integers(1, 200))
+def test_numpy_files_that_are_written_are_read(
+    tmp_path_factory: pytest.TempPathFactory, word: str, columns: Any, cuts: list[int], chunk: int
+) -> None:
+    path = tmp_path_factory.mktemp("npy") / f"r.{word}"
+    write_all(npy.FORMAT.create(path, word, GEOMETRY, {}), columns, cuts)
+    assert read_all(path, chunk)[0] == columns
+    loaded = np.load(path)
+    assert [loaded[name].tolist() for name in "txyp"] == columns
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_a_numpy_array_can_be_read_before_it_is_finished(tmp_path: Path) -> None:
+    with closing(npy.FORMAT.create(tmp_path / "r.npy", "npy", GEOMETRY, {})) as writer:
+        for k in range(12):
+            writer.write(packet([[k], [1], [2], [1]]))
+            assert np.load(tmp_path / "r.npy")["t"].tolist() == list(range(k + 1))
 
 
 def test_an_address_beyond_two_bytes_does_not_wrap_into_the_sensor(tmp_path: Path) -> None:

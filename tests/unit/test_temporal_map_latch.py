@@ -48,7 +48,9 @@ def test_latching_equals_its_slow_twin(events: list[tuple[int, int, int, int]], 
     t, x, y, on = columns(events)
     slots = np.full((SLOTS, HEIGHT * WIDTH), EMPTY, np.int32)
     before, tally = np.zeros(HEIGHT * WIDTH, np.uint16), np.zeros(4, np.int64)
-    latch_first_on(t, x, y, on, begin_us, begin_us + length_us, WIDTH, HEIGHT, slots, before, tally)
+    latch_first_on(
+        t, x, y, on, begin_us, begin_us + length_us, WIDTH, HEIGHT, slots, before, tally, np.empty((2, 7), np.int64)
+    )
     slow_slots, slow_before, slow_tally = naive_map.latch_first_on(
         t, x, y, on, begin_us, begin_us + length_us, WIDTH, HEIGHT
     )

@@ -57,7 +57,7 @@ def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSett
     CameraError
         If the camera cannot be opened.
     ConfigError
-        For a rig that lives in another time.
+        For a rig that lives in another time, or for settings that this camera cannot take.
     """
     if abs(clock.now_ns() - time.monotonic_ns()) > LATE_CLOCK_NS:
         raise ConfigError(
@@ -67,8 +67,8 @@ def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSett
     process = _begin(backend, settings, common)
     try:
         facts = process.wait_ready()
-    except CameraError:
-        process.kill()
+    except BaseException:
+        process.close()
         raise
     kind = type("CapturedCamera", tuple(ABILITIES[name] for name in facts.abilities) or (CapturedCamera,), {})
     camera: CapturedCamera = kind(process, facts, lambda: _begin(backend, settings, common), common.max_delay_ms)
@@ -87,6 +87,7 @@ class CapturedCamera:
 
     def __init__(self, process: CaptureProcess, facts: SourceFacts, begin: Any, max_delay_ms: float) -> None:
         self._process: CaptureProcess | None = process
+        self._ending: CaptureProcess | None = None
         self._facts, self._dtype = facts, facts.dtype()
         self._begin = begin
         self._max_delay_ns = max_delay_ms * NS_PER_MS
@@ -136,6 +137,8 @@ class CapturedCamera:
             return
         process = self._process
         if process is None:
+            if self._ending is not None:
+                self._ending.close()
             process = self._open_again()
         try:
             self._await_ready(process)
@@ -161,6 +164,9 @@ class CapturedCamera:
     def close(self) -> None:
         """Give the camera back; ``start`` would open it again. Idempotent."""
         self._delivering = False
+        if self._ending is not None:
+            self._ending.close()
+            self._ending = None
         if self._process is not None:
             self._process.close()
             self._process = None
@@ -173,7 +179,7 @@ class CapturedCamera:
         """
         process = self._process
         if process is None:
-            if time.monotonic() < self._next_try_s:
+            if time.monotonic() < self._next_try_s or not (self._ending is None or self._ending.ended):
                 return False
             process = self._open_again()
         try:
@@ -273,7 +279,7 @@ class CapturedCamera:
         self._next_try_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
         process: CaptureProcess = self._begin()
-        self._process = process
+        self._process, self._ending = process, None
         return process
 
     def _await_ready(self, process: CaptureProcess) -> None:
@@ -295,9 +301,8 @@ class CapturedCamera:
         self._fault = str(error)
         self._delivering = False
         if self._process is not None:
-            self._process.kill()
             self._notes = self._process.notes()
-            self._process = None
+            self._process, self._ending = None, self._process
 
 
 class _Window(CapturedCamera):

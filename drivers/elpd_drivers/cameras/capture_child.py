@@ -20,6 +20,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -60,20 +61,22 @@ def main(arguments: list[str]) -> int:
         sys.path[:] = hello["path"]
         writer = RingWriter(RingMemory(memory_descriptor, slots, capacity), semaphore)
         faulthandler.dump_traceback_later(hello["open_timeout_s"] + WATCHDOG_S, exit=True)
+        source = None
         try:
             source = _open(hello["backend"], hello["settings"])
-            try:
-                _serve(source, Control(control), writer)
-            finally:
-                source.close()
+            _serve(source, Control(control), writer)
         except Ended:
-            return 0
-        except (ElpdError, BrokenPipeError) as error:
-            _say(control, {"lost": str(error)})
-            return 1
+            status = 0
+        except ElpdError as error:
+            _say(control, {"lost": str(error), "kind": error.kind})
+            status = 1
         except Exception as error:  # noqa: BLE001  (the root of the process: whatever a library raises is the camera's loss)
             _say(control, {"lost": f"camera: its library failed: {type(error).__name__}: {error}"})
-            return 1
+            status = 1
+        if source is not None:
+            with suppress(Exception):  # giving back what is lost may fail in any way
+                source.close()
+        return status
 
 
 class Control:
@@ -153,7 +156,8 @@ def _open(backend: str, settings: dict[str, Any]) -> Source:
 
 
 def _say(control: socket.socket, message: dict[str, Any]) -> None:
-    control.send(json.dumps(message).encode())
+    with suppress(OSError):  # nobody listens any more: the next request says so
+        control.send(json.dumps(message).encode())
 
 
 def _end(_signal: int, _frame: FrameType | None) -> None:

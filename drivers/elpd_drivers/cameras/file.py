@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from elpd.errors import CameraError, ConfigError
+from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.evt2 import HIGH_BITS, LOW_BITS
 from elpd.events.layout import event_columns
-from elpd.events.registers import new_state, new_triggers, take_triggers, time_of
+from elpd.events.registers import HIGH, new_state, new_triggers, take_triggers, time_of
 from elpd.events.split import split_evt2, split_evt3, split_evt21
 from elpd.events.stream import EventStream, open_recording
 from elpd.records import CameraPacket, Encoding, Geometry
@@ -192,13 +193,39 @@ class _Splitter:
     def __init__(self) -> None:
         self._state = new_state()
         self._held = new_triggers()
+        self._latest_us = -FOREVER_US
+        self._piece: CameraPacket | None = None
+        self._rising = np.empty(0, np.int64)
 
     def split(self, piece: CameraPacket, position: int, until_us: int) -> int:
         """Return the index of the first item at or after *position* that is not before *until_us*."""
         if piece.encoding is Encoding.ARRAY:
-            t = event_columns(piece.data)[0]
-            return position + int(np.searchsorted(t[position:], until_us))
-        return SPLITTERS[piece.encoding](piece.data, position, self._state, until_us, self._held)
+            if piece is not self._piece:
+                self._take_times(piece)
+            return position + int(np.searchsorted(self._rising[position:], until_us))
+        position = SPLITTERS[piece.encoding](piece.data, position, self._state, until_us, self._held)
+        if self._state[HIGH] >= 0:
+            self._check(time_of(self._state, *_bits(piece.encoding)))
+        return position
+
+    def _take_times(self, piece: CameraPacket) -> None:
+        """Look through a piece's times: late events are found behind the first that is not before a time."""
+        t = event_columns(piece.data)[0].astype(np.int64, copy=False)
+        self._piece, self._rising = piece, np.maximum.accumulate(t)
+        if t.size:
+            back = self._rising - t > EPOCH_STEP_US
+            self._check(int(t[np.argmax(back)] if back.any() else t[0]), int(self._rising[np.argmax(back)]))
+            self._latest_us = max(self._latest_us, int(self._rising[-1]))
+
+    def _check(self, t_us: int, latest_us: int = -FOREVER_US) -> None:
+        """Raise ``CameraError`` if the clock was set back; else remember the time."""
+        self._latest_us = max(self._latest_us, latest_us)
+        if self._latest_us - t_us > EPOCH_STEP_US:
+            raise CameraError(
+                f"the recording's clock jumps back from {self._latest_us} to {t_us} us: the camera was reset there; "
+                "cut off what comes after with `elpd convert --to-us`"
+            )
+        self._latest_us = max(self._latest_us, t_us)
 
     def first_us(self, piece: CameraPacket) -> int | None:
         """Return the first time that *piece* says, or ``None``."""
@@ -210,11 +237,16 @@ class _Splitter:
         if begin == piece.data.shape[0]:
             return None
         split(piece.data[begin : begin + 1], 0, state, FOREVER_US, new_triggers())
-        return time_of(state, *((12, 12) if piece.encoding is Encoding.EVT3 else (LOW_BITS, HIGH_BITS)))
+        return time_of(state, *_bits(piece.encoding))
 
     def take_triggers(self) -> tuple[Trigger, ...]:
         """Return the edges passed since the last call."""
         return take_triggers(self._state, self._held)
+
+
+def _bits(encoding: Encoding) -> tuple[int, int]:
+    """Return how many bits of time lie below a TIME_HIGH word and how many it has."""
+    return (12, 12) if encoding is Encoding.EVT3 else (LOW_BITS, HIGH_BITS)
 
 
 T = TypeVar("T")

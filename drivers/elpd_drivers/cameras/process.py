@@ -1,7 +1,9 @@
 """A capture process seen from the controller: its start, its messages, its end, none of which may take long.
 
 Whatever ends the child, this side knows at once: the last copy of the other end of the socket is closed with it. A
-child that is lost is killed, never waited for: what it held, the kernel gives back.
+child that hangs is killed: what it held, the kernel gives back. One that says itself that its camera is lost goes on to
+give it back, because a camera that is left in the middle of an answer gives that answer to whoever opens it next; it is
+not waited for here, but before the camera is opened again.
 """
 
 from __future__ import annotations
@@ -15,9 +17,10 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from elpd.errors import CameraError, UsageError
+from elpd.errors import CameraError, ConfigError, UsageError
 from elpd_drivers.cameras.ring import RingMemory, RingReader
 from elpd_drivers.cameras.source import SourceFacts
 
@@ -33,6 +36,9 @@ HANG_MS = 50.0
 
 SECOND_LOOK_MS = 5
 """A machine that stood still stops both processes: the child gets this long to show itself before it counts as hung."""
+
+STARVED_MS = 1000.0
+"""A child that would run if it were let is not hung but starved, by a machine that is too busy: it gets this long."""
 
 CALL_S = 1.0
 """Bias and window changes are a few register writes over USB, some milliseconds each."""
@@ -90,7 +96,7 @@ class CaptureProcess:
         self._calls = 0
         self._reply: dict[str, Any] | None = None
         self._notes: dict[str, float] = {}
-        self._closed = False
+        self._closed, self._told_to_go = False, 0.0
         self._poll = select.poll()
         for descriptor in (self._semaphore, self._control.fileno(), self._said):
             self._poll.register(descriptor, select.POLLIN)
@@ -128,15 +134,18 @@ class CaptureProcess:
             return
         if self._silent_ms() > HANG_MS:
             self.wait(SECOND_LOOK_MS)
-            silent_ms = self._silent_ms()
-            if silent_ms > HANG_MS:
+            silent_ms, limit_ms = self._silent_ms(), STARVED_MS if self._would_run() else HANG_MS
+            if silent_ms > limit_ms:
                 self._lose(
-                    f"camera: its library hangs, nothing for {silent_ms:.0f} ms (limit {HANG_MS:.0f}); "
+                    f"camera: its library hangs, nothing for {silent_ms:.0f} ms (limit {limit_ms:.0f}); "
                     "unplug it and plug it in again"
                 )
 
     def wait_ready(self) -> SourceFacts:
-        """Wait until the camera is open. Raises ``CameraError`` if it cannot be, or takes too long."""
+        """Wait until the camera is open.
+
+        Raises ``CameraError`` if it cannot be or takes too long, ``ConfigError`` if its table is wrong for it.
+        """
         while self.facts is None:
             left_s = self._opened + self._open_timeout_s - time.monotonic()
             self.wait(1e3 * max(0.0, left_s) + 1)
@@ -168,24 +177,27 @@ class CaptureProcess:
         """Return the camera library's counters, after the end as they were last. Never waits."""
         return self._notes if self._closed else self.reader.notes()
 
+    @property
+    def ended(self) -> bool:
+        """Whether the child is gone; one that was told to go and stays too long is killed when this is asked."""
+        if self._child.poll() is None and self._closed and time.monotonic() > self._told_to_go + END_S:
+            self._child.kill()
+        return self._child.poll() is not None
+
     def close(self) -> None:
         """End the child, gently first. Idempotent. No process, memory or descriptor is left."""
-        if self._closed:
-            return
-        with suppress(OSError):
-            self._control.shutdown(socket.SHUT_RDWR)
-        for patience_s, then in ((END_S, signal.SIGTERM), (KILLED_S, signal.SIGKILL)):
-            if self._ended(patience_s):
-                break
-            self._child.send_signal(then)
         self._release()
+        for then in (signal.SIGTERM, signal.SIGKILL):
+            if self._waited(END_S if then == signal.SIGTERM else KILLED_S):
+                return
+            self._child.send_signal(then)
+        self._waited(KILLED_S)
 
     def kill(self) -> None:
         """End the child at once. Idempotent. No process, memory or descriptor is left."""
-        if self._closed:
-            return
         self._child.kill()
         self._release()
+        self._waited(KILLED_S)
 
     # --- below: how it is done -------------------------------------------------------------------------------------
 
@@ -200,8 +212,9 @@ class CaptureProcess:
             self._lose(f"camera: its process {self._how_ended()}; start it again")
         content: dict[str, Any] = json.loads(message)
         if "lost" in content:
-            self._lose(content["lost"])
-        elif "ready" in content:
+            self._release()
+            raise (ConfigError if content.get("kind") == ConfigError.__name__ else CameraError)(content["lost"])
+        if "ready" in content:
             self.facts = SourceFacts.from_data(content["ready"])
         else:
             self._reply = content if content["reply"] == self._calls else None
@@ -218,7 +231,7 @@ class CaptureProcess:
         raise CameraError(reason)
 
     def _how_ended(self) -> str:
-        if not self._ended(KILLED_S):
+        if not self._waited(KILLED_S):
             return "closed its line"
         self._listen()
         status = self._child.returncode
@@ -229,6 +242,14 @@ class CaptureProcess:
     def _silent_ms(self) -> float:
         return (time.monotonic_ns() - self.reader.heartbeat_ns) / 1e6
 
+    def _would_run(self) -> bool:
+        """Say whether the child runs, waits for a processor or for its memory, rather than in a library's call."""
+        try:
+            stat = Path(f"/proc/{self.pid}/stat").read_text(encoding="ascii", errors="replace")
+        except OSError:
+            return False
+        return stat.rpartition(")")[2].split()[0] in {"R", "D"}
+
     def _listen(self) -> None:
         """Keep the end of what the library prints."""
         with suppress(BlockingIOError):
@@ -237,15 +258,17 @@ class CaptureProcess:
             with suppress(KeyError):
                 self._poll.unregister(self._said)  # closed: it would be readable for ever
 
-    def _ended(self, patience_s: float) -> bool:
+    def _waited(self, patience_s: float) -> bool:
         with suppress(subprocess.TimeoutExpired):
             self._child.wait(patience_s)
         return self._child.returncode is not None
 
     def _release(self) -> None:
+        """Give everything but the child back; that its line closes tells it to end."""
+        if self._closed:
+            return
         self._notes = self.reader.notes()
-        self._closed = True
-        self._ended(KILLED_S)
+        self._closed, self._told_to_go = True, time.monotonic()
         self._control.close()
         os.close(self._said)
         os.close(self._semaphore)

@@ -72,6 +72,11 @@ class CsvFormat:
         """Nothing beyond numpy is needed."""
         del word
 
+    def appends(self, word: str) -> bool:
+        """Say yes: lines follow lines."""
+        del word
+        return True
+
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> CsvWriter:
         """Begin a file."""
         del facts

@@ -59,6 +59,11 @@ class DatFormat:
         """Nothing beyond numpy is needed."""
         del word
 
+    def appends(self, word: str) -> bool:
+        """Say yes: events follow events."""
+        del word
+        return True
+
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> DatWriter:
         """Begin a file. Raises ``FormatError`` for a sensor whose addresses do not fit 14 bits."""
         del word

@@ -18,6 +18,7 @@ from elpd.errors import FormatError, UsageError
 from elpd.events.layout import EVENT, event_columns
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
+from elpd_drivers.formats import npy_write
 from elpd_drivers.formats.columns import NAMES, pack
 
 if TYPE_CHECKING:
@@ -53,6 +54,26 @@ class NpyFormat:
         """Open for reading. Raises ``FormatError`` for arrays that are not events."""
         with path.open("rb") as file:
             return NpyReader(path) if file.read(6) == NPY_MAGIC else NpzReader(path)
+
+    @property
+    def writes(self) -> Mapping[str, str]:
+        """``npz``: four arrays; ``npy``: one, structured."""
+        return {"npz": ".npz", "npy": ".npy"}
+
+    def can_write(self, word: str) -> None:
+        """Nothing beyond numpy is needed."""
+        del word
+
+    def appends(self, word: str) -> bool:
+        """Say so of ``npy``: an archive is put together at the end."""
+        return word == "npy"
+
+    def create(
+        self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]
+    ) -> npy_write.NpyWriter | npy_write.NpzWriter:
+        """Begin a file."""
+        del facts
+        return npy_write.NpyWriter(path, geometry) if word == "npy" else npy_write.NpzWriter(path, geometry)
 
 
 FORMAT = NpyFormat()

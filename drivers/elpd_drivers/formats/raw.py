@@ -84,6 +84,11 @@ class RawFormat:
         """Nothing beyond numpy is needed."""
         del word
 
+    def appends(self, word: str) -> bool:
+        """Say yes: words follow words."""
+        del word
+        return True
+
     def create(self, path: Path, word: str, geometry: Geometry, facts: Mapping[str, str]) -> raw_write.RawWriter:
         """Begin a file. Raises ``FormatError`` for a sensor whose addresses do not fit 11 bits."""
         return raw_write.RawWriter(path, word, geometry, facts)

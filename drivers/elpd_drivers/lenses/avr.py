@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from elpd.errors import ConfigError, LensError
 from elpd.motion.trajectory import Motion, Timing
 from elpd.records import LensCapabilities, StopMode
-from elpd.units import NS_PER_MS, after_ms
+from elpd.units import NS_PER_MS, NS_PER_US, after_ms
 from elpd_drivers.lenses import avr_wire as wire
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import limits_from
@@ -39,9 +39,14 @@ SWITCH_STEPS = 32
 SETTLING_SPS = 2000.0
 """A rotor takes a single step at about this speed, however slowly the next one comes."""
 
-START_STEPS, TURN_STEPS = 2.0, 6.0
-"""How far its ramps lag behind the ideal, from rest and through rest: their first steps are single ones. One standard
-deviation, seen on the firmware; reports soon tell how far it truly is."""
+START_STEPS, TURN_STEPS = 0.5, 2.5
+"""How far its ramps stray from the ideal, from rest and through rest, one standard deviation, seen on the firmware."""
+
+SAMPLED_US = 70.0
+"""From a question's last bit to the instant that the answer tells of, in motion: its check, at 16 MHz."""
+
+STEP_NS = 55_000
+"""What a step takes of the processor's time; so much of it everything else has to wait for."""
 
 OUTPUTS = ("iris",)
 
@@ -53,9 +58,10 @@ TRIES = 3
 class AvrSettings:
     """The table ``[lens]`` for our own controller.
 
-    ``watchdog_ms`` is its dead-man; ``sync_steps`` makes one edge on the sync line every so many steps (0: none), for a
-    camera's trigger input. ``start_stop_um_s`` is the speed from which the motor can halt without losing steps.
-    ``latency_us`` is the usual time from a command's last bit to its effect, adapter included.
+    ``watchdog_ms`` is its dead-man; ``sync_steps`` makes an edge on the sync line at each multiple of so many steps (0:
+    none), which is wired to the camera's trigger input ``sync_channel``: the camera then stamps where the lens was.
+    ``start_stop_um_s`` is the speed from which the motor can halt without losing steps. ``latency_us`` is the usual
+    time from a command's last bit to its effect, adapter included.
     """
 
     port: str = ""
@@ -70,10 +76,11 @@ class AvrSettings:
     homing_slow_um_s: float = 150.0
     homing_ms: int = 30_000
     sync_steps: int = 0
+    sync_channel: int = 0
     query_ms: float = 4.0
     reply_ms: float = 50.0
     watchdog_ms: float = 500.0
-    latency_us: float = 60.0
+    latency_us: float = 115.0
     latency_sigma_us: float = 20.0
 
 
@@ -85,12 +92,19 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: AvrSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=4.5))
+        sampled_ns = round(SAMPLED_US * NS_PER_US)
+        motor = Motor(Timing(sampled_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.0))
         return DirectLens(
             AvrController(table, clock, line, motor, latency), line, motor, clock, latency, poll_ms=table.query_ms
         )
 
     return open_on_line(AvrSettings, settings, clock, port, build)
+
+
+def held_up(ns: int, velocity_sps: float) -> int:
+    """Return how much longer than *ns* something takes beside the steps of a motion, ns."""
+    load = min(STEP_NS * abs(velocity_sps) / 1e9, 0.7)
+    return round(ns * load / (1.0 - load))
 
 
 class AvrController:
@@ -127,6 +141,16 @@ class AvrController:
         self._homing_begun = False
         self._iris: tuple[bool, int] | None = None  # what it was told to be and is not known to be, tries
         self._unconfirmed: tuple[int, bytes, int, int] | None = None  # sequence, frame, stops before it, tries
+
+    @property
+    def mark_every_steps(self) -> int:
+        """How many steps lie between two edges on SYNC."""
+        return self._settings.sync_steps
+
+    @property
+    def mark_channel(self) -> int:
+        """The camera's trigger channel that SYNC is wired to."""
+        return self._settings.sync_channel
 
     @property
     def trouble_bytes(self) -> bytes:
@@ -209,14 +233,21 @@ class AvrController:
         frame = wire.encode(sequence, wire.GO, wire.go(target, speed_sps))
         self._unconfirmed = (sequence, frame, self._motor.stops, 1)
         sent = self._line.send(frame)
-        strays = TURN_STEPS if self._motor.under_way else START_STEPS
+        strays, late_ns = START_STEPS, 0
+        if self._motor.under_way:
+            _, velocity_sps = self._motor.state_at(sent.off_wire_ns)
+            # it takes effect at the next step, and the rotor is one behind
+            late_ns = held_up(self._latency.usual_ns, velocity_sps) + round(
+                1.5e9 / max(abs(velocity_sps), SETTLING_SPS)
+            )
+            strays = TURN_STEPS
         motion = Motion(
             self.limits.acceleration_sps2,
             target_steps=float(target),
             speed_sps=speed_sps,
             rounding_steps=strays,
         )
-        return Going(sent.begun_ns, sent.done_ns, [(sent.off_wire_ns, motion)])
+        return Going(sent.begun_ns, sent.done_ns, [(sent.off_wire_ns + late_ns, motion)])
 
     def stopped(self, mode: StopMode, sent: Sent, speed_sps: float) -> int:
         """Let what was not obeyed yet be forgotten; a halt from too high a speed costs steps, and the reference."""

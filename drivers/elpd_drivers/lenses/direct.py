@@ -146,6 +146,21 @@ class Controller(Protocol):
 
 
 @runtime_checkable
+class Marking(Protocol):
+    """A controller that makes an edge each time its count comes to a multiple of so many steps."""
+
+    @property
+    def mark_every_steps(self) -> int:
+        """Of how many steps; 0: the line is not wired."""
+        ...
+
+    @property
+    def mark_channel(self) -> int:
+        """To which of the camera's trigger channels it is wired."""
+        ...
+
+
+@runtime_checkable
 class Switching(Protocol):
     """A controller with outputs of its own."""
 
@@ -284,6 +299,19 @@ class DirectLens:
     def outputs(self) -> Sequence[str]:
         """What the controller can switch beside the motor."""
         return self._controller.outputs if isinstance(self._controller, Switching) else ()
+
+    @property
+    def mark_channel(self) -> int | None:
+        """The camera's trigger channel that the controller's position marks come on; ``None``: none do."""
+        controller = self._controller
+        return controller.mark_channel if isinstance(controller, Marking) and controller.mark_every_steps else None
+
+    def mark(self, when: HostNs) -> bool:
+        """Learn from an edge that the camera has stamped; say whether it is believed."""
+        controller = self._controller
+        if not isinstance(controller, Marking) or not controller.mark_every_steps:
+            return False
+        return self._motor.mark(controller.mark_every_steps, when)
 
     @property
     def remarks(self) -> Sequence[str]:

@@ -6,6 +6,7 @@ impossible is a fault when it is confirmed, and what should be at rest by now an
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 CONFIRMATIONS = 3
 """How often in a row an impossible position must be reported to be a fault instead of a bad reply."""
 
+
+MARK_SHARE = 0.25
+"""A mark further from a multiple of its distance than this share of it might as well belong to the next one."""
 
 RESUMES = 8
 """How often one command may be held up: a controller, or what lies between, that stands still for a moment."""
@@ -113,6 +117,23 @@ class Motor:
         self.rest_due_ns = self.rest_from_ns + grace_ns
 
     # --- what it reports -------------------------------------------------------------------------------------------
+
+    def mark(self, every_steps: int, when: HostNs) -> bool:
+        """Learn that the count came to a multiple of *every_steps* at *when*, the rotor a step behind it.
+
+        Says whether it is believed: only one multiple may be near enough to where the model has the motor.
+        """
+        with self._lock:
+            if not self._trajectory.known:
+                return False
+            velocity = self._trajectory.velocity_at(when)
+            behind = math.copysign(1.0, velocity) if velocity else 0.0
+            count = self._trajectory.position_at(when).steps + behind
+            nearest = round(count / every_steps) * every_steps
+            if abs(count - nearest) > MARK_SHARE * every_steps:
+                return False
+            self._trajectory.mark(nearest - behind, when)
+            return True
 
     def replies_are_held(self, held_ns: int) -> None:
         """Learn how long the line keeps replies back: so much of a report's interval says nothing of its sampling."""

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from elpd.errors import CameraError, UsageError
-from elpd.records import CameraPacket, Encoding, Geometry, Roi
+from elpd.records import CameraPacket, Encoding, Geometry, Roi, Trigger
 from elpd.units import NS_PER_S, NS_PER_US, HostNs, SensorUs
 
 if TYPE_CHECKING:
@@ -52,6 +52,19 @@ class Wire(Protocol):
         """Turn a span's events into what is sent, state carried from span to span; times are sensor time."""
         ...
 
+    def encode_edge(self, edge: Trigger) -> NDArray[Any]:
+        """Turn an edge on the trigger input into what is sent between events; nothing where it travels apart."""
+        ...
+
+
+@runtime_checkable
+class TriggerLine(Protocol):
+    """What is wired to the camera's trigger input."""
+
+    def take_sync_edges(self) -> list[tuple[int, bool]]:
+        """Return (and forget) the edges so far, oldest first: host instant, ns, and the level after it."""
+        ...
+
 
 class ArrayWire:
     """Structured arrays, as vendor libraries give."""
@@ -64,6 +77,11 @@ class ArrayWire:
         out = np.empty(len(events.t_us), EVENT_DTYPE)
         out["t"], out["x"], out["y"], out["on"] = events.t_us, events.x, events.y, events.on
         return out
+
+    def encode_edge(self, edge: Trigger) -> NDArray[Any]:
+        """Return nothing: edges travel beside the array."""
+        del edge
+        return np.empty(0, EVENT_DTYPE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +126,7 @@ class _Sent:
     data: NDArray[Any]
     complete_until_us: int
     frames: tuple[Frame, ...]
+    triggers: tuple[Trigger, ...]
     gap_before: bool
     lost_events: int
 
@@ -141,6 +160,7 @@ class SimulatedCamera:
         ring_packets: int = RING_PACKETS,
         rate_limit: RateLimit | None = None,
         faults: CameraFaults | None = None,
+        trigger_line: TriggerLine | None = None,
     ) -> None:
         self._clock = clock
         self._retina = retina
@@ -156,6 +176,9 @@ class SimulatedCamera:
         self._ring_packets = ring_packets
         self._rate_limit = rate_limit or RateLimit()
         self._faults = faults or CameraFaults()
+        self._trigger_line = trigger_line
+        self._listens_to_line = False
+        self._edges: list[Trigger] = []
         self._ring: deque[_Sent] = deque()
         self._pending: list[tuple[int, Callable[[], None]]] = []
         self._next_flush = 0
@@ -232,6 +255,10 @@ class SimulatedCamera:
         self._at_next_flush(lambda: self._retina.sensor.set_mask(masked))
         return len(masked)
 
+    def enable_trigger(self, *, on: bool) -> None:
+        """Listen to the trigger input from now on, or do not."""
+        self._listens_to_line = on
+
     # --- below: how it is done -------------------------------------------------------------------------------------
 
     def _check_plugged(self) -> None:
@@ -253,15 +280,47 @@ class SimulatedCamera:
         begin_us, end_us = flush * FLUSH_US, (flush + 1) * FLUSH_US
         events = self._rate_limit.thinned(self._retina.expose(begin_us, end_us))
         events.t_us[:] += self._origin_us
-        data = self._wire.encode(events, begin_us + self._origin_us, end_us + self._origin_us)
+        edges = self._edges_until(end_us + self._origin_us)
+        data = self._encode(events, edges, begin_us + self._origin_us, end_us + self._origin_us)
         frames = () if self._frames is None else self._frames.take(end_us, self._origin_us)
         end_ns = self._flush_end_ns(flush)
         self._next_flush += 1
         self._lost += events.lost
         self._gap = self._gap or events.lost > 0
-        self._send(data, len(events.t_us), end_us + self._origin_us, end_ns, frames)
+        self._send(data, len(events.t_us), end_us + self._origin_us, end_ns, frames, edges)
 
-    def _send(self, data: NDArray[Any], count: int, until_us: int, end_ns: int, frames: tuple[Frame, ...]) -> None:
+    def _edges_until(self, end_us: int) -> tuple[Trigger, ...]:
+        """Return the edges on the trigger input before *end_us* that have not been sent yet."""
+        if self._trigger_line is None:
+            return ()
+        for at_ns, level in self._trigger_line.take_sync_edges():
+            if self._listens_to_line:
+                at_us = self._origin_us + (at_ns - self._birth_ns) // NS_PER_US
+                self._edges.append(Trigger(SensorUs(at_us), 0, rising=level))
+        due = tuple(edge for edge in self._edges if edge.t_us < end_us)
+        self._edges = self._edges[len(due) :]
+        return due
+
+    def _encode(self, events: Events, edges: tuple[Trigger, ...], begin_us: int, end_us: int) -> NDArray[Any]:
+        """Return the span's events with its edges between them."""
+        if not edges:
+            return self._wire.encode(events, begin_us, end_us)
+        pieces, taken = [], 0
+        for edge in edges:
+            before = int(np.searchsorted(events.t_us, edge.t_us, side="right"))
+            pieces += [self._wire.encode(events.part(taken, before), begin_us, edge.t_us), self._wire.encode_edge(edge)]
+            taken = before
+        return np.concatenate([*pieces, self._wire.encode(events.part(taken, len(events.t_us)), begin_us, end_us)])
+
+    def _send(
+        self,
+        data: NDArray[Any],
+        count: int,
+        until_us: int,
+        end_ns: int,
+        frames: tuple[Frame, ...],
+        edges: tuple[Trigger, ...],
+    ) -> None:
         jitter_us = min(float(self._jitter.exponential(JITTER_US)), LARGEST_JITTER_US)
         delay_us = LATENCY_US + jitter_us + data.nbytes / USB_BYTES_PER_US
         arrival = max(end_ns + round(delay_us * NS_PER_US), self._last_arrival_ns)
@@ -273,7 +332,8 @@ class SimulatedCamera:
         if dropped or len(self._ring) >= self._ring_packets:
             self._gap, self._lost = True, self._lost + count
             return
-        self._ring.append(_Sent(arrival, data, until_us, frames, self._gap, self._lost))
+        beside = edges if self._wire.encoding is Encoding.ARRAY else ()
+        self._ring.append(_Sent(arrival, data, until_us, frames, beside, self._gap, self._lost))
         self._gap, self._lost = False, 0
 
     def _deliver(self, sent: _Sent, now: HostNs) -> CameraPacket:
@@ -283,6 +343,7 @@ class SimulatedCamera:
             received_ns=now,
             complete_until_us=SensorUs(sent.complete_until_us),
             frames=sent.frames,
+            triggers=sent.triggers,
             gap_before=sent.gap_before,
             lost_events=sent.lost_events,
             backlog=sum(waiting.arrival_ns <= now for waiting in self._ring),

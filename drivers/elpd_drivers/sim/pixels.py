@@ -20,7 +20,8 @@ BLOCK = 2048
 
 @kernel(
     "int64(float32[::1], float32[::1], float32[::1], float32[::1], uint8[::1], uint8[::1], uint8[::1], int64[::1],"
-    "float32, float32, float32, int64, int64, int64, int64, int64[::1], int64[::1], uint8[::1])"
+    "float32, float32, float32, int64, int64, int64, int64, int64[::1], int64[::1], uint8[::1])",
+    allocates=True,
 )
 def step_pixels(
     target: NDArray[np.float32],

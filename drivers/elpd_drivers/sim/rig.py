@@ -19,12 +19,12 @@ import numpy as np
 from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.ports import RigParts
-from elpd.records import Encoding, Geometry, LensReport, Roi
+from elpd.records import Encoding, Geometry, LensReport, Roi, Trigger
 from elpd.scale import LensScale
 from elpd.units import Steps, after_ms
 from elpd_drivers.lenses.axis import read_settings
 from elpd_drivers.sim.aperture import SimulatedAperture
-from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, Wire
+from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, TriggerLine, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
 from elpd_drivers.sim.drift import Drift
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
@@ -65,7 +65,8 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in. Focus moves along the travel by ``drift_um_s``.
+    believes in. Focus moves along the travel by ``drift_um_s``. With ``sync_steps`` the board's sync line, which makes
+    an edge at every multiple of so many steps, is wired to the camera's trigger input, unless ``sync_cut``.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -127,6 +128,8 @@ class SimSettings:
     backlash_um: float = 4.0
     acceleration_um_s2: float = 400_000.0
     microstep_error_um: float = 0.0
+    sync_steps: int = 0
+    sync_cut: bool = False
     # faults of the camera
     camera_vanishes_at_s: float | None = None
     camera_silent_from_s: float | None = None
@@ -147,6 +150,10 @@ class Evt3Wire:
         del begin_us
         words = self._encoder.encode(events.t_us, events.x, events.y, events.on).copy()
         return np.concatenate([words, self._encoder.encode_time(end_us)])
+
+    def encode_edge(self, edge: Trigger) -> NDArray[Any]:
+        """Return its words."""
+        return self._encoder.encode_trigger(edge.t_us, edge.id, rising=edge.rising).copy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +307,9 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         scale=scale,
         drift=drift,
     )
-    return RigParts(world, _camera(chosen, world, light, geometry), lens, aperture, scale, truth)
+    wired = chosen.sync_steps and not chosen.sync_cut
+    line = port.wire.board if wired and isinstance(port.wire.board, TriggerLine) else None
+    return RigParts(world, _camera(chosen, world, light, geometry, line), lens, aperture, scale, truth)
 
 
 def _stack(scene: str, geometry: Geometry, brightness: float) -> DefocusStack:
@@ -378,6 +387,10 @@ def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[
     wanted = Wanted(chosen.um_per_step, chosen.travel_um, 3 * chosen.speed_um_s, chosen.acceleration_um_s2)
     port, table = fitted(chosen.board, mechanism, wanted, world, seed=chosen.seed)
     world.add(port)
+    if chosen.sync_steps:
+        if not isinstance(port.wire.board, TriggerLine):
+            raise ConfigError(f"sim.sync_steps: the board {chosen.board!r} has no sync line; sim.board=avr has")
+        table = {**table, "sync_steps": chosen.sync_steps}
     lens = controller(chosen.board).open_lens(table, world, port)
     if not lens.capabilities.stop_on_command:  # nor does such a controller remember where it is: as a person would
         here = Steps(round(mechanism.rotor_at(world.now_ns())))
@@ -406,7 +419,9 @@ def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
     )
 
 
-def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geometry) -> SimulatedCamera:
+def _camera(
+    chosen: SimSettings, world: World, light: LightField, geometry: Geometry, line: TriggerLine | None
+) -> SimulatedCamera:
     seed, width, height = chosen.seed, geometry.width, geometry.height
     sensor = EventSensor(
         width,
@@ -438,6 +453,7 @@ def _camera(chosen: SimSettings, world: World, light: LightField, geometry: Geom
         mask_slots=MASK_SLOTS[chosen.camera],
         serial=f"simulated-{seed}",
         ring_packets=chosen.ring_packets,
+        trigger_line=line,
         rate_limit=RateLimit(chosen.rate_limit_mev_s, told=chosen.rate_limit_told),
         faults=CameraFaults(
             chosen.camera_vanishes_at_s, chosen.camera_silent_from_s, chosen.drop_from_s, chosen.drop_for_s

@@ -67,6 +67,10 @@ class Events:
     on: NDArray[np.uint8]
     lost: int = 0
 
+    def part(self, begin: int, end: int) -> Events:
+        """Return those from index *begin* to *end*."""
+        return Events(self.t_us[begin:end], self.x[begin:end], self.y[begin:end], self.on[begin:end])
+
 
 class EventSensor:
     """The pixels of a window and their state.

@@ -80,6 +80,7 @@ class AvrBoard:
         self._bytes = (ctypes.c_uint8 * ROOM)()
         self._ways = (ctypes.c_int32 * ROOM)()
         self._speaking = bytearray()
+        self._syncs: list[tuple[int, bool]] = []
         self._spoke_ns = begin_ns
         self._output: deque[tuple[int, bytes]] = deque()
         self._now_ns = begin_ns
@@ -112,6 +113,7 @@ class AvrBoard:
                 raise LensError("the firmware crashed under simavr")
             self._turn()
             self._listen()
+            self._note_syncs()
 
     def take_output(self) -> list[tuple[int, bytes]]:
         """Return (and forget) what was handed to the wire."""
@@ -150,6 +152,11 @@ class AvrBoard:
     def sync_edges(self) -> int:
         """How many edges SYNC has had."""
         return int(self._bench.bench_sync_edges(self._handle))
+
+    def take_sync_edges(self) -> list[tuple[int, bool]]:
+        """Return (and forget) the edges on SYNC so far: when, and the level after it."""
+        taken, self._syncs = self._syncs, []
+        return taken
 
     @property
     def outputs(self) -> dict[str, bool]:
@@ -195,6 +202,10 @@ class AvrBoard:
     def _target(self, at_ns: int) -> float:
         """Return the step that the rotor is on, or on its way to."""
         return round(self.lens.pulses_at(at_ns)) if self._goal is None else self._goal
+
+    def _note_syncs(self) -> None:
+        count = self._bench.bench_syncs(self._handle, self._cycles, self._ways, ROOM)
+        self._syncs += [(self._time_of(self._cycles[index]), bool(self._ways[index])) for index in range(count)]
 
     def _listen(self) -> None:
         count = self._bench.bench_sent(self._handle, self._cycles, self._bytes, ROOM)
@@ -275,6 +286,7 @@ def load_bench() -> ctypes.CDLL:
     bench.bench_receive.argtypes = [handle, ctypes.c_uint8]
     bench.bench_place.argtypes = [handle, ctypes.c_int32]
     bench.bench_sent.argtypes = [handle, words, ctypes.POINTER(ctypes.c_uint8), ctypes.c_uint32]
+    bench.bench_syncs.argtypes = [handle, words, ctypes.POINTER(ctypes.c_int32), ctypes.c_uint32]
     bench.bench_steps.argtypes = [handle, words, ctypes.POINTER(ctypes.c_int32), ctypes.c_uint32]
     for name in ("bench_close", "bench_reset", "bench_iris", "bench_steps_made", "bench_sync_edges"):
         getattr(bench, name).argtypes = [handle]

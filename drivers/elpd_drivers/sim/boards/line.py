@@ -7,9 +7,12 @@ carry the same faults, because a cable fails in the same ways whoever holds its 
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import select
+import struct
+import termios
 import threading
 import time
 import tty
@@ -25,6 +28,10 @@ if TYPE_CHECKING:
 
     from elpd.ports import Clock
     from elpd.units import HostNs
+
+
+TIOCGEXCL = 0x80045440
+"""Linux: whether a terminal is marked exclusive; Python does not name it."""
 
 
 class SimulatedBoard(Protocol):
@@ -199,6 +206,7 @@ class PtyServer:
     """
 
     _TICK_S = 0.002
+    _LOOK_S = 0.1
 
     def __init__(self, board: SimulatedBoard) -> None:
         self.wire = Wire(board)
@@ -226,11 +234,15 @@ class PtyServer:
         self._master = self._slave = self._wake_read = self._wake_write = -1
 
     def _serve(self) -> None:
+        looked_ns = time.monotonic_ns()
         while True:
             readable, _, _ = select.select([self._master, self._wake_read], [], [], self._TICK_S)
             if self._wake_read in readable:
                 return
             now = time.monotonic_ns()
+            if now - looked_ns > self._LOOK_S * 1e9:
+                looked_ns = now
+                self._free_from_the_dead()
             if self._master in readable:
                 with suppress(BlockingIOError):
                     self.wire.send(os.read(self._master, 4096), now)
@@ -241,3 +253,19 @@ class PtyServer:
                     answer = answer[os.write(self._master, answer) :]
                 except BlockingIOError:
                     break  # nobody reads: a UART drops it too
+
+    def _free_from_the_dead(self) -> None:
+        """Clear the mark of exclusive use that a killed program left; on a real port the last close does that.
+
+        Here we have it open too. Who lives and holds the port exclusively also holds its lock (``serial_port``), so the
+        lock says whether the mark is meant.
+        """
+        marked = struct.unpack("i", fcntl.ioctl(self._slave, TIOCGEXCL, bytes(4)))[0]
+        if not marked:
+            return
+        try:
+            fcntl.flock(self._slave, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return
+        fcntl.ioctl(self._slave, termios.TIOCNXCL)
+        fcntl.flock(self._slave, fcntl.LOCK_UN)

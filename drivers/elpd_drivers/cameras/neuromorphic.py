@@ -1,0 +1,356 @@
+"""Live cameras through neuromorphic-drivers: EVK4, EVK3 HD, CenturyArks, DAVIS346, DVXplorer, without a vendor's SDK.
+
+Prophesee cameras are read raw: the library's own parser drops trigger channels it does not know and the rate
+controller's counts, and our kernels read words anyway. iniVation cameras are taken as the arrays that the library
+makes, with their frames and trigger edges.
+
+Rows: the library counts the rows of its masks from below, as its own pictures show them, while the rows in the words
+(and Prophesee's registers) count from above. Windows and masks are turned over here.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from elpd.errors import CameraError, ConfigError, UsageError
+from elpd.records import BiasSet, Encoding, Frame, Geometry, Trigger
+from elpd.units import SensorUs
+from elpd_drivers.cameras.capture import CapturedCamera, open_captured
+from elpd_drivers.cameras.refusals import explain
+from elpd_drivers.cameras.ring import Captured
+from elpd_drivers.cameras.source import CaptureSettings, SourceFacts, layout_of, need, read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from elpd.ports import Clock
+    from elpd_drivers.cameras.words import WordStream
+
+INSTALL = "pip install 'elpd[neuromorphic]'"
+EVENTS = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
+BUFFERS_IN_FLIGHT = 32
+RATE_PERIOD_US = 200
+"""The rate controller counts in periods; the one that the maker's examples use."""
+
+MASK_SLOTS = {"prophesee_evk4": 64, "inivation_davis346": 8}
+USB3_LATENCY_US = 150.0
+"""Assumed until measured: a micro-frame of 125 us and its interrupt. ``camera.min_latency_us`` replaces it."""
+
+MODELS = {
+    "evk4": "prophesee_evk4",
+    "evk3-hd": "prophesee_evk3_hd",
+    "centuryarks-vga": "centuryarks_vga",
+    "davis346": "inivation_davis346",
+    "dvxplorer": "inivation_dvxplorer",
+}
+
+
+class BiasTables(BaseModel):
+    """The two settings of the sensor's biases, by the library's names; others stay as the factory set them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    expose: dict[str, int] = {}
+    focus: dict[str, int] = {}
+
+
+class NeuromorphicSettings(CaptureSettings):
+    """The table ``[camera]`` for the driver ``neuromorphic``.
+
+    ``model`` is ``auto`` (what is plugged in) or one of ``MODELS``. ``rate_limit_mev_s`` bounds what a Prophesee sensor
+    sends, ``trigger`` listens to an EVK4's trigger input: the library sets both when it opens and not later.
+    ``usb_packets`` is how many buffers of 128 KiB it keeps. ``exposure_us`` and ``frame_interval_us`` are a DAVIS346's.
+    """
+
+    model: Literal["auto", "evk4", "evk3-hd", "centuryarks-vga", "davis346", "dvxplorer"] = "auto"
+    biases: BiasTables = BiasTables()
+    rate_limit_mev_s: Annotated[float, Field(gt=0, le=1000)] | None = None
+    trigger: bool = True
+    usb_packets: Annotated[int, Field(gt=BUFFERS_IN_FLIGHT, le=4096)] = 256
+    exposure_us: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
+    frame_interval_us: Annotated[int, Field(ge=1, le=10_000_000)] = 40_000
+
+
+def open_camera(settings: Mapping[str, Any], clock: Clock) -> CapturedCamera:
+    """Open a camera through neuromorphic-drivers, in a process of its own; see ``NeuromorphicSettings``.
+
+    Raises ``ConfigError`` for a wrong table, ``CameraError`` if there is no such camera or it cannot be opened.
+    """
+    table = read_table(NeuromorphicSettings, settings)
+    need("neuromorphic_drivers", INSTALL)
+    return open_captured(f"{__name__}:open_source", table.model_dump(mode="json"), table, clock)
+
+
+def open_source(settings: dict[str, Any]) -> NeuromorphicSource:
+    """Open the camera, in the capture process."""
+    import neuromorphic_drivers as nd  # noqa: PLC0415  (a library that may abort is loaded in the capture process alone)
+
+    table = NeuromorphicSettings.model_validate(settings)
+    try:
+        kind, serial = _choose(nd, table)
+        module = getattr(nd, kind)
+        configuration = _configured(module, table)
+        device = nd.open(
+            configuration,
+            iterator_timeout=0.005,
+            raw=kind not in {"inivation_davis346", "inivation_dvxplorer"},
+            serial=serial,
+            ring_configuration=module.RingConfiguration(
+                ring_length=table.usb_packets, parallel_submissions=BUFFERS_IN_FLIGHT
+            ),
+            iterator_maximum_raw_packets=1,
+        )
+    except RuntimeError as error:
+        raise CameraError(explain(str(error), "neuromorphic-drivers")) from None
+    _check_bounds(table.biases, device.biases_bounds(), kind)
+    return NeuromorphicSource(device, module, kind, configuration, table)
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What the library has said so far."""
+
+    dropped: int = 0
+    overflows: int = 0
+    backlog: int = 0
+    most_backlog: int = 0
+
+
+class NeuromorphicSource:
+    """A ``Source`` over an open device of the library. Use ``open_source``."""
+
+    def __init__(self, device: Any, module: Any, kind: str, configuration: Any, table: NeuromorphicSettings) -> None:
+        self._device, self._module, self._kind = device, module, kind
+        self._configuration, self._biases = configuration, table.biases
+        self._exposure_us = table.exposure_us
+        self._seen = _Seen()
+        self._words = _word_stream(kind)
+        properties = device.properties()
+        latency_us = USB3_LATENCY_US if table.min_latency_us is None else table.min_latency_us
+        if self._words is not None and table.min_latency_us is None:
+            from elpd_drivers.cameras.words import STEP_BACK_US  # noqa: PLC0415  (with the kernels, where they are used)
+
+            latency_us += STEP_BACK_US
+        self.facts = SourceFacts(
+            geometry=Geometry(int(properties.width), int(properties.height)),
+            encoding=Encoding.ARRAY if self._words is None else Encoding.EVT3,
+            model=str(device.name().value),
+            serial=str(device.serial()),
+            min_latency_us=latency_us,
+            layout=layout_of(EVENTS) if self._words is None else None,
+            abilities=tuple(_abilities(kind, configuration)),
+        )
+
+    def read(self, timeout_s: float) -> Captured | None:
+        """Wait for the library's next packet; its patience was set when it was opened."""
+        del timeout_s
+        try:
+            status, packet = next(self._device)
+        except RuntimeError as error:
+            raise CameraError(explain(str(error), "neuromorphic-drivers")) from None
+        now_ns = time.monotonic_ns()
+        if status.ring is None or packet is None:
+            return None
+        received_ns = now_ns - round(1e9 * (status.system_time - status.ring.system_time))
+        seen = self._seen
+        seen.dropped, seen.backlog = status.ring.dropped_packets, status.ring.backlog
+        seen.most_backlog = max(seen.most_backlog, seen.backlog)
+        if self._words is not None:
+            gap = bool(status.ring.overflow_indices)
+            seen.overflows += gap
+            return self._words.captured(packet, received_ns, gap_before=gap, backlog=seen.backlog)
+        return self._arrays(status, packet, received_ns)
+
+    def call(self, name: str, arguments: Sequence[Any]) -> Any:
+        """Use an ability; the library writes the registers from a thread of its own, within some milliseconds."""
+        if name == "temperature_c":
+            return float(self._device.temperature_celsius())
+        change: dict[str, Callable[..., dict[str, Any]]] = {
+            "set_window": self._window,
+            "apply_biases": self._bias_set,
+            "set_mask": self._mask,
+        }
+        self._configuration = replace(self._configuration, **change[name](*arguments))
+        self._device.update_configuration(self._configuration)
+        return min(len(arguments[0]), MASK_SLOTS[self._kind]) if name == "set_mask" else None
+
+    def notes(self) -> Mapping[str, float]:
+        """Return what the library counted, and what the sensor's rate controller held back."""
+        return {
+            "usb_packets_dropped": self._seen.dropped,
+            "usb_overflows": self._seen.overflows,
+            "usb_backlog": self._seen.backlog,
+            "most_usb_backlog": self._seen.most_backlog,
+            "rate_controller_dropped": 0 if self._words is None else self._words.held_back,
+        }
+
+    def close(self) -> None:
+        """Stop the sensor and give the device back. Idempotent."""
+        self._device.close()
+
+    # --- below: how it is done -------------------------------------------------------------------------------------
+
+    def _arrays(self, status: Any, packet: Any, received_ns: int) -> Captured:
+        """Turn a packet of arrays into ours. Raises ``CameraError`` if the library's layout is another than known."""
+        events = packet.polarity_events
+        if events is None:
+            events = np.empty(0, EVENTS)
+        elif events.dtype != EVENTS:
+            raise CameraError(
+                f"camera: neuromorphic-drivers delivers events as {events.dtype}, known is {EVENTS}; install the "
+                f"version that elpd was made for: {INSTALL}"
+            )
+        gap = any(
+            indices is not None and len(indices) > 0
+            for indices in (packet.polarity_events_overflow_indices, packet.trigger_events_overflow_indices)
+        )
+        self._seen.overflows += gap
+        return Captured(
+            events,
+            received_ns,
+            complete_until_us=int(status.ring.current_t),
+            events=len(events),
+            frames=tuple(_frame(frame, self._exposure_us) for frame in getattr(packet, "frames", ())),
+            triggers=() if packet.trigger_events is None else tuple(_edges(packet.trigger_events)),
+            gap_before=gap,
+            backlog=status.ring.backlog,
+        )
+
+    def _window(self, window: list[int] | None) -> dict[str, Any]:
+        width, height = self.facts.geometry.width, self.facts.geometry.height
+        if self._kind == "inivation_davis346":
+            x, y, w, h = window or [0, 0, width, height]
+            return {"region_of_interest": self._module.RegionOfInterest(left=x, top=y, width=w, height=h)}
+        mask = self._module.RowColumnMask(set=window is not None)
+        if window is not None:
+            x, y, w, h = window
+            mask.clear_rectangle(x=x, y=height - y - h, width=w, height=h)
+        return {"x_mask": mask.x_mask(), "y_mask": mask.y_mask()}
+
+    def _bias_set(self, name: str) -> dict[str, Any]:
+        chosen = self._biases.expose if BiasSet(name) is BiasSet.EXPOSE else self._biases.focus
+        return {"biases": self._module.Biases(**chosen)}
+
+    def _mask(self, pixels: list[list[int]]) -> dict[str, Any]:
+        geometry = self.facts.geometry
+        for x, y in pixels:
+            if not (0 <= x < geometry.width and 0 <= y < geometry.height):
+                raise UsageError(
+                    f"camera: pixel {x},{y} lies outside the sensor of {geometry.width}x{geometry.height}; "
+                    "give only pixels inside it"
+                )
+        chosen = pixels[: MASK_SLOTS[self._kind]]
+        if self._kind == "inivation_davis346":
+            codes = [1 + x + geometry.width * y for x, y in chosen]
+            return {"pixel_mask": tuple(codes + [0] * (MASK_SLOTS[self._kind] - len(codes)))}
+        import neuromorphic_drivers as nd  # noqa: PLC0415  (see open_source)
+
+        mask = nd.PropheseeEvk4PixelMask()
+        for slot, (x, y) in enumerate(chosen):
+            mask.set(slot, x, geometry.height - 1 - y)
+        return {"pixel_mask": mask.pixel_mask()}
+
+
+def _choose(nd: Any, table: NeuromorphicSettings) -> tuple[str, str]:
+    """Find the camera that is meant. Raises ``CameraError`` with what is there instead."""
+    wanted = MODELS.get(table.model)
+    listed = nd.list_devices()
+    there = [(device.name.name.lower(), device.serial) for device in listed if device.error is None]
+    fitting = [
+        (kind, serial)
+        for kind, serial in there
+        if serial is not None and wanted in {None, kind} and table.serial in {None, serial}
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    found = ", ".join(f"{kind.replace('_', ' ')} {serial}" for kind, serial in there)
+    if fitting:
+        raise CameraError(f"camera: several would do ({found}); choose one with camera.serial")
+    errors = [device.error for device in listed if device.error is not None]
+    if errors and not there:
+        raise CameraError(explain(errors[0], "neuromorphic-drivers"))
+    asked = " ".join(filter(None, (table.model if wanted else "", table.serial or ""))) or "any"
+    raise CameraError(
+        f"camera: none found (asked for: {asked}; plugged in: {found or 'none that neuromorphic-drivers knows'}); "
+        "check the cable and camera.model; `elpd check` lists what is plugged in"
+    )
+
+
+def _configured(module: Any, table: NeuromorphicSettings) -> Any:
+    """Build the library's configuration; the sensor begins with the biases for focusing."""
+    known = {field.name for field in fields(module.Configuration)}
+    for where, biases in (("expose", table.biases.expose), ("focus", table.biases.focus)):
+        names = {field.name for field in fields(module.Biases)}
+        for name in biases:
+            if name not in names:
+                raise ConfigError(
+                    f"camera.biases.{where}.{name}: this camera has no such bias; it has {', '.join(sorted(names))}"
+                )
+    wanted: dict[str, Any] = {"biases": module.Biases(**table.biases.focus)}
+    if "enable_external_trigger" in known:
+        wanted["enable_external_trigger"] = table.trigger
+    if "exposure_us" in known:
+        wanted |= {"exposure_us": table.exposure_us, "frame_interval_us": table.frame_interval_us}
+    if table.rate_limit_mev_s is not None:
+        if "rate_limiter" not in known:
+            raise ConfigError("camera.rate_limit_mev_s: this camera has no rate controller; remove the key")
+        most = max(1, round(table.rate_limit_mev_s * RATE_PERIOD_US))
+        wanted["rate_limiter"] = module.RateLimiter(reference_period_us=RATE_PERIOD_US, maximum_events_per_period=most)
+    return module.Configuration(**wanted)
+
+
+def _check_bounds(biases: BiasTables, bounds: Any, kind: str) -> None:
+    """Refuse biases that this very sensor cannot be set to. Raises ``ConfigError``."""
+    for where, table in (("expose", biases.expose), ("focus", biases.focus)):
+        for name, value in table.items():
+            allowed = getattr(bounds, name, None)
+            if allowed is not None and not allowed.minimum <= value <= allowed.maximum:
+                raise ConfigError(
+                    f"camera.biases.{where}.{name}: {value} is outside what this {kind.replace('_', ' ')} takes, "
+                    f"{allowed.minimum} to {allowed.maximum}"
+                )
+
+
+def _abilities(kind: str, configuration: Any) -> list[str]:
+    known = {field.name for field in fields(configuration)}
+    abilities = {
+        "window": bool(known & {"x_mask", "region_of_interest"}),
+        "biases": "biases" in known,
+        "mask": kind in MASK_SLOTS,
+        "temperature": kind == "prophesee_evk4",
+    }
+    return [name for name, has in abilities.items() if has]
+
+
+def _word_stream(kind: str) -> WordStream | None:
+    if kind.startswith("inivation"):
+        return None
+    from elpd_drivers.cameras.words import WordStream  # noqa: PLC0415  (with the kernels, where they are used)
+
+    return WordStream(Encoding.EVT3)
+
+
+def _frame(frame: Any, exposure_us: int) -> Frame:
+    """Date a frame: the middle of its exposure. Where the library missed an edge, the set exposure stands in."""
+    begin, end = frame.exposure_start_t, frame.exposure_end_t
+    if begin is None and end is None:
+        begin = frame.start_t
+    if begin is None:
+        begin = end - exposure_us
+    if end is None:
+        end = begin + exposure_us
+    return Frame(SensorUs(int((begin + end) // 2)), SensorUs(int(frame.t)), int(end - begin), frame.pixels)
+
+
+def _edges(events: Any) -> list[Trigger]:
+    """Return trigger edges; of a pulse, which begins and ends at once, the rising one."""
+    polarity = events["polarity"] if "polarity" in events.dtype.names else events["rising"]
+    return [
+        Trigger(SensorUs(int(t)), int(channel), rising=int(edge) > 0)
+        for t, channel, edge in zip(events["t"], events["id"], polarity, strict=True)
+    ]

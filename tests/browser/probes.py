@@ -1,0 +1,44 @@
+"""Small pieces of JavaScript that look at the page from inside."""
+
+FRAME = """async (url) => {
+  const frame = document.createElement("iframe");
+  frame.src = url;
+  document.body.append(frame);
+  await new Promise((done) => { frame.onload = done; });
+  try { return frame.contentDocument !== null; } catch { return false; }
+}"""
+"""Whether this page can look into a frame with another one."""
+
+SEND = "async ([url, options]) => { try { await fetch(url, options); } catch {} }"
+
+FOCUSED = """() => {
+  const at = document.activeElement;
+  const ring = (element) => getComputedStyle(element).outlineStyle !== "none";
+  const shown = ring(at) || Boolean(at.nextElementSibling && ring(at.nextElementSibling));
+  return { id: at.id || at.value || at.className || at.tagName, shown };
+}"""
+"""What has the keyboard, and whether that can be seen."""
+
+PALE = """() => {
+  const linear = (c) => (c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4);
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const numbers = (css) => css.match(/[\\d.]+/g).map(Number);
+  const ground = (element) => {
+    for (let at = element; at; at = at.parentElement) {
+      const colour = numbers(getComputedStyle(at).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  const pale = {};
+  for (const element of document.querySelectorAll("h2, p, label, dt, dd, button:enabled, summary, .link, .state")) {
+    if (!element.checkVisibility() || !element.textContent.trim() || element.closest(".stage")) continue;
+    const both = [light(numbers(getComputedStyle(element).color)), light(ground(element))].sort((a, b) => b - a);
+    const ratio = (both[0] + 0.05) / (both[1] + 0.05);
+    if (ratio < 4.5) pale[element.id || element.textContent.trim().slice(0, 30)] = ratio.toFixed(2);
+  }
+  return pale;
+}"""
+"""Texts whose contrast is below 4.5 (WCAG 2, AA), with it."""
+
+MOVING = "document.getAnimations().filter((one) => one.playState === 'running').length"

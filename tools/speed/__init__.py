@@ -1,0 +1,1 @@
+"""What ``tools/throughput.py`` measures: streams to run on, our kernels, and what others offer."""
