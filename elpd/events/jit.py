@@ -77,8 +77,8 @@ def _taken_in(function: Any) -> str:
             continue
         seen.add(id(one))
         digest.update(_content(one.__code__.co_filename))
-        inside = inspect.getclosurevars(one)
-        for name, value in sorted({**inside.globals, **inside.nonlocals}.items()):
+        # What a function closes over is in numba's own key; here it would tell variants apart that share an index.
+        for name, value in sorted(inspect.getclosurevars(one).globals.items()):
             if isinstance(value, int | float | np.generic):
                 digest.update(f"{name}={value!r}".encode())
             elif isinstance(value, _Intrinsic):
