@@ -238,11 +238,11 @@ def test_stop_finds_a_way_past_commands_and_pictures_that_nobody_answers(opened:
 def test_a_tab_in_the_background_lets_go_and_comes_back(opened: Opener, rig: Rig) -> None:
     page = opened()
     hide = "(hidden) => { Object.defineProperty(document, 'hidden', { value: hidden, configurable: true }); }"
-    page.evaluate(hide, True)  # noqa: FBT003
+    page.evaluate(hide, True)
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     expect(page.locator("#link-text")).to_have_text("offline")
     rig.phase("probe")
-    page.evaluate(hide, False)  # noqa: FBT003
+    page.evaluate(hide, False)
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     expect(page.locator("#link-text")).to_have_text("live")
     expect(page.locator("#phase-now")).to_have_text("Setting out: which way is focus?")
