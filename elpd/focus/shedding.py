@@ -1,11 +1,11 @@
 """Too many events for this computer: whole slices are left out, the oldest first, and it is said how much.
 
 What waits in the camera's ring is old by the time its turn comes, and a decision made of it stops the lens late. So
-when more waits than a sweep can afford, packets are let go unread until what comes next is fresh. Dropping whole slices
-keeps sums fair: within what was heard nothing is missing, so ELP and its noise shrink together. Time stays exact: of a
-slice that is let go the words that say the time are handed on, and windows know how much of them was not looked at. To
-everybody else it is loss like any other: the packet says what it lacks, confidence falls with it, and beyond
-``safety.LOSS_LIMIT`` the cycle gives up.
+when more waits than a sweep can afford, and it does not get less, packets are let go unread until what comes next is
+fresh. Dropping whole slices keeps sums fair: within what was heard nothing is missing, so ELP and its noise shrink
+together. Time stays exact: of a slice that is let go the words that say the time are handed on, and windows know how
+much of them was not looked at. To everybody else it is loss like any other: the packet says what it lacks, confidence
+falls with it, and beyond ``safety.LOSS_LIMIT`` the cycle gives up.
 """
 
 from __future__ import annotations
@@ -30,6 +30,13 @@ MOST_WAITING_US = 10_000
 MOST_PACKETS = 64
 """The same for a camera that does not say what its packets are complete until: they come each 150 us at the most."""
 
+PATIENCE = 8
+"""Packets over which the backlog may be seen to shrink: a computer that stood still for a moment (a command that took
+long, another program) makes up for it in a few milliseconds, and loses nothing."""
+
+DESPAIR = 10.0
+"""So many times what may wait is let go in any case: the scene is no longer the one in which it happened."""
+
 SLICES = 4096
 
 
@@ -53,6 +60,7 @@ class Shedding:
         self._slices: deque[tuple[int, int]] = deque(maxlen=SLICES)
         self._until_us: int | None = None
         self._behind = self._gap = False
+        self._waited: deque[float] = deque(maxlen=PATIENCE)
         self.shed_us = 0
 
     def take(self, packet: CameraPacket) -> CameraPacket:
@@ -60,7 +68,8 @@ class Shedding:
         begin_us, self._until_us = self._until_us, packet.complete_until_us
         end_us = packet.complete_until_us
         slice_us = end_us - begin_us if begin_us is not None and end_us is not None else None
-        self._behind = self._too_much(packet.backlog, slice_us)
+        first = begin_us is None and end_us is not None  # how long its slice is nobody knows
+        self._behind = not first and self._too_much(packet.backlog, slice_us)
         if not self._behind:
             after_gap, self._gap = self._gap, False
             return replace(packet, gap_before=True) if after_gap else packet
@@ -82,11 +91,12 @@ class Shedding:
         return sum(max(0, min(end, end_us) - max(begin, begin_us)) for begin, end in self._slices)
 
     def _too_much(self, backlog: int, slice_us: int | None) -> bool:
-        # Down to half the limit once it has begun: few long gaps are easier to judge around than many short ones.
-        share = 0.5 if self._behind else 1.0
-        if slice_us is None or slice_us <= 0:
-            return backlog > share * MOST_PACKETS
-        return backlog * slice_us > share * MOST_WAITING_US
+        waiting = backlog * slice_us / MOST_WAITING_US if slice_us else backlog / MOST_PACKETS
+        shrinks = len(self._waited) < PATIENCE or waiting < self._waited[0]
+        self._waited.append(waiting)
+        if self._behind:  # down to half: few long gaps are easier to judge around than many short ones
+            return waiting > 0.5
+        return waiting > DESPAIR or (waiting > 1.0 and not shrinks)
 
     def _count(self, packet: CameraPacket) -> int:
         events = self._decoder.feed(replace(packet, gap_before=True))
@@ -107,6 +117,6 @@ def _only_time(words: NDArray[Any], encoding: Encoding) -> NDArray[Any]:
     lows = np.flatnonzero(kinds == 0x6)[-1:]
     # A TIME_HIGH that changes clears the low part and a repeated one does not: which it is shows in the order of these.
     before = highs[highs < lows[0]][-1:] if lows.size else highs[:0]
-    after = highs[highs > lows[0]][-1:] if lows.size else highs[-1:]
+    after = highs[highs > lows[0]] if lows.size else highs[-1:]  # all: one that changes it and one that changes it back
     kept: NDArray[Any] = words[np.concatenate((before, lows, after))]
     return kept

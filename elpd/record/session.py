@@ -14,6 +14,7 @@ from elpd.calibrate.sensor import sensor_in_use
 from elpd.focus import stored_map
 from elpd.focus.cycle import FocusCycle, Observer, result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
+from elpd.ports import Remarks
 from elpd.record.journal import RunWriter
 from elpd.records import Outcome
 
@@ -92,5 +93,7 @@ def focus_on(
         result = cycle.run()
         truth = None if parts.truth is None else parts.truth.errors(result)
         run.finish(result_fields(result), truth=truth)
+    if isinstance(parts.lens, Remarks):  # about the line, not the cycle: a replay has none
+        result = replace(result, warnings=(*result.warnings, *parts.lens.remarks))
     structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
     return Session(result, truth, run.path, cycle.map, cycle.reference, cycle.passage)

@@ -485,6 +485,23 @@ def test_unknown_and_wrong_settings_are_refused(kind: str) -> None:
         made.open(min_um=100.0, max_um=50.0)
 
 
+@needs("remembers", "the controller does not remember where it is")
+def test_closing_after_a_move_leaves_the_reference_to_the_next(kind: str) -> None:
+    made = open_rig(kind)
+    made.lens.move_to(Steps(3400), SPEED_SPS)
+    made.live_until(lambda: bool(made.reports) and made.reports[-1].steps == pytest.approx(3400, abs=2), 500)
+    made.reports.clear()
+    made.live_until(lambda: bool(made.reports) and not made.reports[-1].moving, 200)
+    made.lens.close()
+    made.plug_in()
+    made.open()
+    made.live(20)
+    assert LensFlag.REFERENCED in made.reports[-1].flags
+    made.lens.move_to(Steps(3300), SPEED_SPS)
+    made.live(300)
+    assert made.rotor == pytest.approx(3300, abs=0.01)
+
+
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_closing_stops_the_motor(kind: str) -> None:
     made = open_rig(kind)

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import Rig, rig
 
+from elpd.records import LensFlag
+
 
 class Wire:
     """The read/write object that ``ticlib`` wants, in virtual time."""
@@ -267,3 +269,10 @@ def test_a_host_that_falls_silent_is_outlived_by_a_second_at_most() -> None:
     made.clock.pass_ms(1100)
     assert not made.moving
     assert made.rotor < 3200 + 1300
+
+
+def test_it_homes_faster_than_the_lens_may_sweep() -> None:
+    made = rig("tic")
+    made.open(max_speed_um_s=100.0)  # the board homes at its own settings' speed, which is higher
+    report = made.lens.home(made.soon(60_000))
+    assert LensFlag.REFERENCED in report.flags

@@ -1,5 +1,6 @@
 """What is let go while too much waits, and what is still known of it."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from streams import evt2_words, evt3_stream, evt21_words, seeds
 from elpd.events.evt2_encode import Evt2Encoder, Evt21Encoder
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.events.stream import DECODERS
-from elpd.focus.shedding import MOST_PACKETS, Shedding, _only_time
+from elpd.focus.shedding import MOST_PACKETS, PATIENCE, Shedding, _only_time
 from elpd.records import CameraPacket, Encoding, Geometry, Roi
 from elpd.vision.elp import ElpWindows
 
@@ -46,7 +47,7 @@ def slices(encoding: Encoding, backlogs: list[int], *, events: int = 200) -> Any
 
 @pytest.mark.parametrize("encoding", list(Encoding))
 def test_windows_of_what_was_heard_are_what_they_would_have_been(encoding: Encoding) -> None:
-    packets, inside = slices(encoding, [0, 0, 30, 25, 15, 11, 10, 3, 0, 0])
+    packets, inside = slices(encoding, [0, 0, 300, 250, 150, 11, 10, 3, 0, 0])
     weights = np.random.default_rng(1).integers(-100, 100, (48, 64))
     member = np.zeros((48, 64), bool)
     member[12:36, 16:48] = True
@@ -72,13 +73,21 @@ def test_windows_of_what_was_heard_are_what_they_would_have_been(encoding: Encod
 
 def test_without_a_promise_packets_are_counted() -> None:
     shedding = Shedding(ROI, GEOMETRY)
-    word = np.array([0x8001, 0x0010, 0x2014], np.uint16)
-    lost = [
-        shedding.take(CameraPacket(word, Encoding.EVT3, 0, backlog=backlog)).lost_events
-        for backlog in (MOST_PACKETS, MOST_PACKETS + 1, MOST_PACKETS // 2 + 1, MOST_PACKETS // 2, MOST_PACKETS)
-    ]
-    assert lost == [0, 1, 1, 0, 0]
+    assert losses(shedding, [*[MOST_PACKETS + 1] * PATIENCE]) == [0] * PATIENCE
+    backlogs = (MOST_PACKETS + 1, MOST_PACKETS // 2 + 1, MOST_PACKETS // 2, MOST_PACKETS)
+    assert losses(shedding, backlogs) == [1, 1, 0, 0]
     assert shedding.shed_us == 0
+
+
+def test_a_backlog_that_is_made_up_for_costs_nothing() -> None:
+    shedding = Shedding(ROI, GEOMETRY)
+    assert losses(shedding, range(9 * MOST_PACKETS, 0, -1)) == [0] * 9 * MOST_PACKETS
+
+
+def losses(shedding: Shedding, backlogs: Iterable[int]) -> list[int]:
+    word = np.array([0x8001, 0x0010, 0x2014], np.uint16)
+    packets = (CameraPacket(word, Encoding.EVT3, 0, backlog=backlog) for backlog in backlogs)
+    return [shedding.take(packet).lost_events for packet in packets]
 
 
 @settings(max_examples=200)

@@ -335,7 +335,7 @@ class DirectLens:
     def close(self) -> None:
         """Stop if moving, and give the port back. Idempotent."""
         try:
-            if self._motor.report is None or self._motor.under_way:
+            if self._motor.may_move:
                 self._line.send(self._controller.stop_bytes[StopMode.ABRUPT])
         except LensError:
             pass  # the line is dead: the motion ends at its target

@@ -92,6 +92,12 @@ class Motor:
         """Whether a motion was commanded whose end was not seen yet, or the newest report says so."""
         return self.rest_due_ns is not None or (self.report is not None and self.report.moving)
 
+    @property
+    def may_move(self) -> bool:
+        """Whether it was not seen at rest since its last motion should have ended."""
+        report = self.report
+        return report is None or report.moving or (self.under_way and report.earliest_ns < self.rest_from_ns)
+
     # --- what it was told ------------------------------------------------------------------------------------------
 
     def command(self, motion: Motion, effective_ns: int, sigma_ns: float, *, grace_ms: float | None = None) -> int:

@@ -275,7 +275,10 @@ class TicController:
         self.asking.answered()
         reply = parse_reply(bytes(self._received), crc=self._settings.crc_responses)
         self._received.clear()
-        if reply is None or abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps:
+        # it homes at speeds of its own settings
+        if reply is None or (
+            abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps and not reply.flags & wire.HOMING
+        ):
             return None  # the silence limit counts on; the next query resynchronises
         self._newest = reply
         velocity = reply.velocity_sps
