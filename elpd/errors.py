@@ -14,6 +14,7 @@
     ├── BusyError             somebody else holds the rig (exit code 4)
     │   ├── UnavailableError        the daemon is starting or going down
     │   └── UnreachableError        no daemon answers
+    ├── CancelledError        somebody ended it before it began (exit code 1)
     ├── ForbiddenError        the caller may look, not touch (exit code 4)
     ├── TooLargeError         a message past its limit (exit code 2)
     └── ReplayDiverged        a recorded run did not replay to the same calls
@@ -90,6 +91,12 @@ class UnavailableError(BusyError):
 
 class UnreachableError(BusyError):
     """No daemon answers, or not in time."""
+
+
+class CancelledError(ElpdError):
+    """Somebody ended it before it had begun."""
+
+    kind = "Cancelled"
 
 
 class ForbiddenError(ElpdError):

@@ -22,8 +22,8 @@ def command(*, mode: Any, period_s: float | None, as_json: bool, **where: Any) -
     if as_json:
         print_json(dict(answer))
         return 0
-    every = "" if answer["period_s"] is None else f", every {answer['period_s']:g} s"
+    every = f", every {answer['period_s']:g} s" if answer["mode"] == "scheduled" else ""
     print(f"{answer['mode']}{every}")
     for name, value in answer["hold"].items():
-        print(f"  {name:20s}{value}")
+        print(f"  {name:20s}{'-' if value is None else value}")
     return 0

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 READ_BYTES = 1 << 16
 
+LOOK_UP_S = 0.25
+"""A signal that comes just before a wait begins is not seen by it; so no wait is longer."""
+
 
 class NotSentError(UnreachableError):
     """The connection was gone before the request left: it may be sent again, over a new one."""
@@ -139,7 +142,7 @@ class Link:
 
     def _read(self, left_s: float) -> tuple[list[dict[str, Any]], str]:
         try:
-            if not ready(self._socket, select.POLLIN, left_s):
+            if not ready(self._socket, select.POLLIN, min(left_s, LOOK_UP_S)):
                 return [], ""
             data = self._socket.recv(READ_BYTES)
             return (self._lines.feed(data), "") if data else ([], "the daemon closed the connection")

@@ -7,21 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from elpd.errors import (
-    BusyError,
-    CameraError,
-    ConfigError,
-    DeviceError,
-    ElpdError,
-    FaultLatchedError,
-    ForbiddenError,
-    LensError,
-    TooLargeError,
-    UnavailableError,
-    UnreachableError,
-    UnreferencedError,
-    UsageError,
-)
+from elpd import errors
+from elpd.errors import BusyError, DeviceError, ElpdError, UnreachableError, UsageError
 
 SYSTEM_SOCKET = Path("/run/elpd/elpd.sock")
 
@@ -39,22 +26,9 @@ PATIENCE_S = {"focus": 60.0, "home": 60.0, "move": 30.0, "jog": 30.0, "preset": 
 
 _ERRORS: dict[str, type[ElpdError]] = {
     "Busy": BusyError,
-    **{
-        error.kind: error
-        for error in (
-            CameraError,
-            ConfigError,
-            DeviceError,
-            FaultLatchedError,
-            ForbiddenError,
-            LensError,
-            TooLargeError,
-            UnavailableError,
-            UnreferencedError,
-            UsageError,
-        )
-    },
+    **{kind.kind: kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, ElpdError)},
 }
+"""What the daemon calls an error, and what it is here."""
 
 
 def socket_path(given: str | Path | None = None) -> Path:
