@@ -309,8 +309,6 @@ def test_kernels_are_kept_where_the_rest_is_read_only(controller: Controller) ->
     controller.machine("systemctl", "restart", "elpd")
     assert sorted(controller.machine(*listed).stdout.splitlines()) == sorted(before)
     assert controller.machine("stat", "--format=%s", damaged).stdout != f"{len('garbage')}\n"
-    assert {line["ELPD_KERNEL"] for line in controller.journal("ELPD_EVENT=damaged kernel made anew")} < {
-        "decode_evt2",
-        "decode_evt21",
-    }
+    (told,) = {line["ELPD_KERNEL"] for line in controller.journal("ELPD_EVENT=damaged kernel made anew")}
+    assert told.rpartition(".")[2] in {"decode_evt2", "decode_evt21"}
     assert controller.show("ActiveState") == ["active"]
