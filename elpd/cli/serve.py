@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -14,13 +15,15 @@ from elpd.errors import ElpdError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from elpd.config import Config
     from elpd.service.engine import RigEngine
     from elpd.service.notify import Notifier
 
 SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+
+IN_FORCE = "elpd.toml"
+"""In the unit's runtime directory."""
 
 
 @click.command("serve")
@@ -34,6 +37,7 @@ def command(*, config_path: Path | None, overrides: tuple[str, ...], as_json: bo
     are taken.
     """
     config = _paced(load(config_path, overrides))
+    _remember_for_parking(config_path)
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # before there are threads: they all inherit it
     from elpd.service.api import ApiServer  # noqa: PLC0415  (numba and pydantic only now)
     from elpd.service.engine import RigEngine  # noqa: PLC0415
@@ -60,7 +64,7 @@ def command(*, config_path: Path | None, overrides: tuple[str, ...], as_json: bo
         notifier.ready(_one_line(engine))
         if as_json:
             print_json({"pid": os.getpid(), "socket": api.path, "state": engine.situation.state})
-        _until_told(engine, notifier, lambda: load(config_path, overrides))
+        _until_told(engine, notifier, lambda: load(config_path, overrides), lambda: _remember_for_parking(config_path))
         notifier.stopping()
     finally:
         ended = threads.stop()
@@ -68,7 +72,9 @@ def command(*, config_path: Path | None, overrides: tuple[str, ...], as_json: bo
     return 0 if ended else 3
 
 
-def _until_told(engine: RigEngine, notifier: Notifier, read: Callable[[], Config]) -> None:
+def _until_told(
+    engine: RigEngine, notifier: Notifier, read: Callable[[], Config], accepted: Callable[[], None]
+) -> None:
     """Return when a signal says that this is the end; take other configurations meanwhile."""
     import structlog  # noqa: PLC0415  (with the rest)
 
@@ -83,8 +89,20 @@ def _until_told(engine: RigEngine, notifier: Notifier, read: Callable[[], Config
             notifier.ready(_one_line(engine))
             continue
         engine.situation.unwarn("config-refused")
+        accepted()
         engine.reload(config, lambda: notifier.ready(_one_line(engine)))
     log.info("asked to end", signal=signal.Signals(number).name)
+
+
+def _remember_for_parking(path: Path | None) -> None:
+    """Keep a copy of the configuration in force for `elpd park`: what is on disk may be changed, and wrong, since."""
+    folder = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if not folder or path is None:
+        return
+    place = Path(folder, IN_FORCE)
+    beside = place.with_suffix(".new")
+    beside.write_bytes(path.read_bytes())
+    beside.replace(place)
 
 
 def _schedule(engine: RigEngine, config: Config) -> None:

@@ -261,6 +261,17 @@ def test_a_wrong_configuration_at_the_start_ends_it_once_with_the_line(controlle
     assert controller.status()["lens"]["position_um"] == where_um
 
 
+def test_the_lens_is_stopped_by_the_configuration_in_force_not_by_what_is_on_disk_since(controller: Controller) -> None:
+    asked = controller.moving()
+    controller.configure("rig = 'hardware'\nrg = 1\n")
+    controller.machine("systemctl", "kill", "--signal=KILL", "--kill-whom=main", "elpd")
+    controller.machine.until(lambda: controller.show("ActiveState") == ["failed"], "the wrong configuration's end")
+    asked.communicate(timeout=120)
+    controller.ready()
+    assert any("at rest at" in line["MESSAGE"] for line in controller.journal("_TRANSPORT=stdout"))
+    assert controller.status()["lens"]["position_um"] < 15000.0
+
+
 def test_a_crash_loop_ends_and_the_lens_is_left_alone(controller: Controller) -> None:
     machine, folder = controller.machine, "/run/systemd/system/elpd.service.d"
     where_um = controller.status()["lens"]["position_um"]
@@ -297,5 +308,7 @@ def test_kernels_are_kept_where_the_rest_is_read_only(controller: Controller) ->
     controller.machine.write(damaged, "garbage")
     controller.machine("systemctl", "restart", "elpd")
     assert sorted(controller.machine(*listed).stdout.splitlines()) == sorted(before)
-    assert controller.machine("cat", damaged).stdout != "garbage"
+    assert controller.machine("stat", "--format=%s", damaged).stdout != f"{len('garbage')}\n"
+    (told,) = {line["ELPD_KERNEL"] for line in controller.journal("ELPD_EVENT=damaged kernel made anew")}
+    assert told.rpartition(".")[2] in {"decode_evt2", "decode_evt21"}
     assert controller.show("ActiveState") == ["active"]
