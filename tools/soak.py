@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 RIG = (
     "sim.width=160", "sim.height=120", "sim.scene=camera", "focus.roi_fraction=0.8", "sim.noise_hz=0.2",
-    "journal.budget_mb=20", "journal.keep=8", "service.poll_ms=400", "service.look_s=0.8", "service.look_every_s=100",
+    "journal.budget_mb=20", "journal.keep=8", "service.poll_ms=400", "service.look_s=0.8", "service.look_every_s=80",
     "modes.hold_off_s=5",
 )  # fmt: skip
 KNOCK_S = 0.4

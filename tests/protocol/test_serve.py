@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -34,10 +34,12 @@ class Served:
     folder: Path
     heard: queue.Queue[str]
     hello: dict[str, Any]
+    connections: list[Connection] = field(default_factory=list)
 
     def connect(self) -> Connection:
-        """Open another connection."""
-        return Connection(self.hello["socket"])
+        """Open another connection; the fixture closes it."""
+        self.connections.append(Connection(self.hello["socket"]))
+        return self.connections[-1]
 
     def heard_until(self, word: str) -> str:
         """Return the next datagram for the supervisor that begins with a word."""
@@ -115,6 +117,8 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
 
     yield begin
     for served in begun:
+        for connection in served.connections:
+            connection.close()
         if served.process.poll() is None:
             served.process.kill()
         served.process.communicate()

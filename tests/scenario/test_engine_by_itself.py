@@ -163,6 +163,8 @@ def test_a_focus_thread_that_hangs_has_its_lens_stopped_and_no_watchdog_fed(tmp_
     supervisor = Supervisor(daemon.engine, notifier)  # type: ignore[arg-type]
     supervisor.look()
     assert notifier.fed == 1
+    asked = daemon.ask("move", fraction=1.0)
+    assert daemon.engine.place.take() is asked.job
     daemon.parts.lens.run(2000.0, daemon.truth.world.now_ns() + 2_000_000_000)
     daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 20_000_000)
     assert daemon.velocity != 0.0
@@ -175,9 +177,22 @@ def test_a_focus_thread_that_hangs_has_its_lens_stopped_and_no_watchdog_fed(tmp_
     assert daemon.status.fault is not None
     assert daemon.status.fault.kind == "Hang"
     assert daemon.status.counters.faults == 1
+    assert asked.job.cancelled
     beats.beat("focus")
     supervisor.look()
     assert notifier.fed == 2
+
+
+def test_a_focus_thread_that_is_slow_while_nothing_is_done_is_no_fault(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path).begin()
+    clock = [100.0]
+    daemon.engine.heartbeats._now_s = lambda: clock[0]
+    daemon.engine.heartbeats.expect("focus", FOCUS_LIMIT_S)
+    notifier = FakeNotifier()
+    clock[0] += FOCUS_LIMIT_S + 0.1
+    Supervisor(daemon.engine, notifier).look()  # type: ignore[arg-type]
+    assert notifier.fed == 0
+    assert daemon.status.state == "READY"
 
 
 class FakeNotifier:
