@@ -12,7 +12,6 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
-from elpd.calibrate.aperture import with_profile
 from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.lens import teach
 from elpd.errors import ConfigError, DeviceError
@@ -79,6 +78,8 @@ def build(config: Config) -> RigParts:
     teach(parts.lens, config)
     if not parts.lens.capabilities.stop_on_command:
         parts = replace(parts, lens=_in_moves(parts, config))
+    from elpd.calibrate.aperture import with_profile  # noqa: PLC0415  (brings numba: a lens alone is stopped without)
+
     return replace(parts, aperture=with_profile(config, parts.aperture))
 
 

@@ -100,7 +100,7 @@ def why_not() -> str | None:
         )
     if tried.returncode:
         return f"no private namespaces here: {tried.stderr.strip()}"
-    if not _cgroups().is_dir():
+    if not cgroups().is_dir():
         return "no cgroup v2 hierarchy"
     return None
 
@@ -163,8 +163,8 @@ class Booted:
         self._console = b""
         self._init: int | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._folder = Path(tempfile.mkdtemp(prefix="elpd-booted-"))
-        self._cgroup = _cgroups() / self._folder.name
+        self.folder = Path(tempfile.mkdtemp(prefix="elpd-booted-"))
+        self._cgroup = cgroups() / self.folder.name
 
     def __enter__(self) -> Self:
         try:
@@ -226,10 +226,10 @@ class Booted:
             _kill(self._process.pid)
             self._process.wait()
         self._remove_cgroups()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _boot(self) -> None:
-        tree, files, binds = (self._folder / name for name in ("tree", "files", "binds"))
+        tree, files, binds = (self.folder / name for name in ("tree", "files", "binds"))
         tree.mkdir()
         for name, content in self._files.items():
             path = files / name
@@ -296,7 +296,8 @@ class Booted:
 _ENV = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LANG": "C.UTF-8"}
 
 
-def _cgroups() -> Path:
+def cgroups() -> Path:
+    """Return where cgroups of version 2 are."""
     unified = Path("/sys/fs/cgroup/unified")
     return unified if unified.is_dir() else Path("/sys/fs/cgroup")
 

@@ -114,12 +114,15 @@ def all_settings(config: Config) -> dict[str, Any]:
 
 
 def first_direction_wrong(ended: list[dict[str, Any]], true_focus_um: float | None) -> bool | None:
-    """Say whether the first verdict was wrong: turned from focus, or took it for passed on the way from it."""
+    """Say whether the first verdict was wrong: turned from focus, or did not on the way from it.
+
+    A way to focus that a rule ended is no verdict.
+    """
     if not ended or true_focus_um is None:
         return None
     first = ended[0]
     ahead = (true_focus_um - first["begun_um"]) * (first["ended_um"] - first["begun_um"]) > 0.0
-    return bool(first["end"] == ("behind" if ahead else "passed"))
+    return bool((first["end"] == "behind") == ahead)
 
 
 def stopped_early(ended: list[dict[str, Any]], true_focus_um: float | None, depth_of_focus_um: float) -> bool:
@@ -151,7 +154,9 @@ def summary(rows: list[dict[str, Any]], depth_of_focus_um: float) -> str:
     focused = [row for row in rows if row["outcome"] == "FOCUSED"]
     outcomes = ", ".join(f"{count} {name}" for name, count in Counter(row["outcome"] for row in rows).most_common())
     wrong = sum(is_false(row, depth_of_focus_um) for row in rows)
+    judged = [row["first_direction_wrong"] for row in rows if row.get("first_direction_wrong") is not None]
     lines = ["", f"{len(rows)} cycles: {outcomes}; {wrong} false (FOCUSED beyond {depth_of_focus_um:g} um)"]
+    lines.append(f"first direction wrong: {sum(judged)} of {len(judged)}, of refused cycles too")
     if not focused:
         return "\n".join(lines)
     lines.append(f"{'':22s}{'median':>9s}{'mean':>9s}{'p95':>9s}{'worst':>9s}")

@@ -41,6 +41,8 @@ from elpd.units import HostNs
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.ports import Clock
+
 RIG = (
     "sim.width=160", "sim.height=120", "sim.scene=camera", "focus.roi_fraction=0.8", "sim.noise_hz=0.2",
     "journal.budget_mb=20", "journal.keep=8", "service.poll_ms=400", "service.look_s=0.8", "service.look_every_s=100",
@@ -50,6 +52,7 @@ KNOCK_S = 0.4
 """How long after the camera began to listen focus is knocked away; the rest of the look hears of it."""
 
 KNOCK_UM = 90.0
+FAR_UM = 250.0
 ROOM_UM = 500.0
 """Focus stays so far from the ends of the travel."""
 
@@ -67,14 +70,19 @@ PEOPLE = tuple(Caller(number, 1000 + number, 1000, f"person {number}") for numbe
 class LeapingTime(VirtualTime):
     """Virtual time that leaps over naps."""
 
-    world: World | None = None
+    _world: World | None = None
+
+    def follow(self, clock: Clock | None) -> None:
+        """Go on by another world's time."""
+        super().follow(clock)
+        self._world = clock if isinstance(clock, World) else None
 
     def nap(self, seconds: float) -> None:
         """Let time pass in one step."""
-        if self.world is None:
+        if self._world is None:
             super().nap(seconds)
         else:
-            self.world.leap_to(HostNs(self.world.now_ns() + round(seconds * 1e9)))
+            self._world.leap_to(HostNs(self._world.now_ns() + round(seconds * 1e9)))
 
 
 class Soak:
@@ -116,7 +124,7 @@ class Soak:
     def _build(self, config: Config) -> Any:
         parts = rig.build(config)
         assert isinstance(parts.clock, World)
-        self.time.world, self.offset_um = None, 0.0
+        self.offset_um = 0.0
         self.world, self.truth = parts.clock, parts.truth
         return parts
 
@@ -126,7 +134,7 @@ class Soak:
         self._until(lambda: self.engine.keeper.parts is not None and self.engine.situation.fault is None, 30.0)
         if self.engine.situation.lens.referenced is not True:
             self._wait(self.ask("home"))
-            self._wait(self.ask("move", fraction=float(self.chance.uniform(0.3, 0.7))))
+            self._wait(self.ask("move", to_um=self._somewhere_um()))
         self._wait(self.ask("mode", mode="continuous"))
 
     def run(self, hours: float) -> None:
@@ -150,8 +158,6 @@ class Soak:
     # --- one turn ---
 
     def _turn(self) -> None:
-        if self.engine.keeper.parts is not None:
-            self.time.world = self.world
         self.engine.step()
         self.elapsed_s = self.time.now_s()
         self._check()
@@ -213,6 +219,10 @@ class Soak:
         job.add_done_callback(lambda answer: self._answered(number, method, answer))
         return number
 
+    def _somewhere_um(self) -> float:
+        """Return a place from which focus can be found; a map from a millimetre off shows nothing."""
+        return self.truth.focus_carriage_um + self.offset_um + float(self.chance.uniform(-FAR_UM, FAR_UM))
+
     def _answered(self, number: int, method: str, answer: Answer) -> None:
         if self.waiting.pop(number, None) is None:
             self.doubled.append(f"{method} {number}")
@@ -225,7 +235,7 @@ class Soak:
         chance = self.chance
         wishes: dict[str, Callable[[], dict[str, Any]]] = {
             "focus": lambda: {"on_disconnect": "cancel" if chance.random() < 0.5 else "finish"},
-            "move": lambda: {"fraction": float(chance.uniform(0, 1))},
+            "move": lambda: {"to_um": self._somewhere_um()},
             "jog": lambda: {"by_um": float(chance.normal(0, 100))},
             "preset": lambda: {"action": "save", "name": f"p{chance.integers(3)}"},
             "stop": dict,
@@ -264,7 +274,7 @@ class Soak:
             "camera unplugged": lambda: self._break_camera(vanishes_at_s=0.0),
             "camera silent": lambda: self._break_camera(silent_from_s=0.0),
             "stopped for a moment": lambda: self._jump(0.7),
-            "stopped for long": lambda: self._jump(30.0),
+            "stopped for long": lambda: self._jump(3.0),
             "killed": self._kill,
             "state damaged": self._damage,
             "reloaded": lambda: self.engine.reload(self.config("focus.deadline_ms=4000")),

@@ -177,11 +177,14 @@ def load(directory: Path, kind: type[P]) -> P | None:
     Raises ``FormatError`` for a file that is damaged, of another kind or of another version.
     """
     path = path_of(directory, kind)
+    return read(path, kind) if path.exists() else None
+
+
+def read(path: Path, kind: type[P]) -> P:
+    """Return the profile of a kind that a file holds. Raises as ``load``, and where there is no such file."""
     again = f"run `elpd calibrate {kind.KIND}` again, or delete the file"
     try:
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return None
     except (OSError, UnicodeDecodeError) as error:
         raise FormatError(f"{path}: the profile cannot be read ({error}); {again}") from None
     try:

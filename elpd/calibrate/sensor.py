@@ -9,15 +9,17 @@ import structlog
 from pydantic import BaseModel, ConfigDict
 
 from elpd.calibrate.lag import measure_lag
-from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, state_directory
+from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, read, state_directory
 from elpd.calibrate.quantity import Quantity
 from elpd.calibrate.resting import FALSE_ALARMS, measure_rest, unmeasured
 from elpd.calibrate.thresholds import NoiseRates, measure_absolute, measure_balance
+from elpd.errors import UsageError
 from elpd.records import SensorProfile
 from elpd.vision.refractory import refractory_period
 
 if TYPE_CHECKING:
     from datetime import datetime
+    from pathlib import Path
 
     from elpd.calibrate.evidence import Columns, Evidence
     from elpd.config import Config
@@ -106,6 +108,21 @@ def sensor_in_use(config: Config, camera: EventCamera) -> SensorProfile | None:
         path = path_of(directory, SensorCalibration)
         structlog.get_logger(__name__).warning("sensor profile not used", path=str(path), reason=difference)
         return None
+    return stored.for_use()
+
+
+def sensor_of_file(path: Path, geometry: Geometry) -> SensorProfile:
+    """Return what the profile in a file says of the sensor that made a recording.
+
+    A recording does not say which camera it is of; only its size can be compared. Raises ``FormatError`` for what is no
+    sensor profile, ``UsageError`` for one of another size.
+    """
+    stored = read(path, SensorCalibration)
+    if (stored.on.width, stored.on.height) != (geometry.width, geometry.height):
+        raise UsageError(
+            f"{path}: was measured on {stored.on.width}x{stored.on.height} pixels, the recording has "
+            f"{geometry.width}x{geometry.height}; give the profile of the camera that made it"
+        )
     return stored.for_use()
 
 

@@ -39,6 +39,7 @@ COMMANDS = {
     "preset": "places of the lens that the daemon remembers",
     "record": "what the camera sees, to a file; nothing moves",
     "replay": "run a recorded cycle again, to the same decision",
+    "report": "a recorded run as one HTML page",
     "roi": "the daemon's regions",
     "serve": "the daemon: own the rig, answer on a socket",
     "sim-board": "a simulated lens controller on a pty",

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from elpd.calibrate.profile import path_of, state_directory
+from elpd.calibrate.sensor import SensorCalibration, sensor_of_file
 from elpd.cli.common import config_options, json_option, parse_interval_us, parse_roi, print_json
 from elpd.cli.replay import run_cycle
 from elpd.config import load
@@ -46,6 +48,11 @@ if TYPE_CHECKING:
 @click.option("--speed-um-s", type=float, help="Constant speed of the lens.")
 @click.option("--lens-path", "lens_path", type=click.Path(path_type=Path), help="CSV with rows t_us,position_um.")
 @click.option("--dof-um", type=float, help="Depth of focus.")
+@click.option(
+    "--sensor",
+    metavar="FILE|stored",
+    help="What `elpd calibrate sensor` measured of the camera that made the recording; `stored` is this rig's own.",
+)
 @click.option("--method", type=click.Choice(["elpd", "paper"]), default="elpd", show_default=True)
 @config_options
 @json_option
@@ -59,6 +66,7 @@ def command(
     speed_um_s: float | None,
     lens_path: Path | None,
     dof_um: float | None,
+    sensor: str | None,
     method: str,
     *,
     config_path: Path | None,
@@ -66,7 +74,7 @@ def command(
     as_json: bool,
 ) -> int:
     """Find focus in a recorded sweep, using nothing later than the decision."""
-    load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
+    config = load(config_path, overrides)
     aperture_us = parse_interval_us(aperture_text, "--aperture-us")
     roi = parse_roi(roi_text)
     ruler = _ruler(speed_um_s, lens_path)
@@ -75,7 +83,9 @@ def command(
     given = None if reference_path is None else read_picture(reference_path)
     size = None if given is None else Geometry(given.pixels.shape[1], given.pixels.shape[0])
     recorded = read_run_sweep(path) if is_run(path) else None
-    as_recorded = not any((roi, frames, reference_path, aperture_us, speed_um_s, lens_path, dof_um, method == "paper"))
+    as_recorded = not any(
+        (roi, frames, reference_path, aperture_us, speed_um_s, lens_path, dof_um, sensor, method == "paper")
+    )
     if recorded is not None and as_recorded:
         found = _run_again(path, recorded)
         if found is not None:
@@ -118,7 +128,20 @@ def command(
     if method == "paper":
         found = detect_as_published(sweep, roi, pixels if picture is None else _as_published(picture), begin_us)
         return _finish(found, as_json=as_json)
-    search = SweepSearch(sweep, roi, ruler, depth_of_focus_um=dof_um, begin_us=begin_us, reference=reference)
+    known = None
+    if sensor is not None:
+        file = path_of(state_directory(config), SensorCalibration) if sensor == "stored" else Path(sensor)
+        known = sensor_of_file(file, sweep.geometry)
+    search = SweepSearch(
+        sweep,
+        roi,
+        ruler,
+        depth_of_focus_um=dof_um,
+        begin_us=begin_us,
+        reference=reference,
+        sensor=known,
+        max_sigma_dof=config.focus.max_sigma_dof,
+    )
     return _finish(search.run(), as_json=as_json)
 
 

@@ -53,7 +53,7 @@ def command(
     as_json: bool,
     config_path: Path | None,
     overrides: tuple[str, ...],
-) -> None:
+) -> int:
     """Make an HDR picture from the first ON event of each pixel while an aperture opened.
 
     The default profile is an iris: what lenses have, and what the method's authors assume. A wrong profile stretches
@@ -85,6 +85,7 @@ def command(
         print_json(answer)
     else:
         _tell(image, out, "found" if aperture is None else "given", verdict if usable else f"BAD: {verdict}")
+    return 0 if usable else 1
 
 
 def _gather(file: Path, aperture: tuple[int, int] | None, size: Geometry | None) -> FirstEventMap:

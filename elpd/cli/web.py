@@ -17,7 +17,7 @@ from elpd.client import socket_path
 from elpd.config import load
 from elpd.errors import BusyError, ConfigError, UsageError
 from elpd.web.security import Gate, is_loopback, own_hosts
-from elpd.web.token import read_or_make_token, token_path
+from elpd.web.token import read_or_make_token, read_token, token_path
 
 if TYPE_CHECKING:
     from elpd.config import WebSection
@@ -38,15 +38,16 @@ def command(
     """
     config = load(config_path, overrides)
     _check_hosts(config.web)
-    path = token_path(config.web.token_file)
-    token = read_or_make_token(path)
     if link:
+        token, path = read_token(config.web.token_file)
         address = f"{_address(config.web, config.web.port)}#token={token}"
         if as_json:
             print_json({"address": address, "token_file": path})
         else:
             print(address)
         return 0
+    path = token_path(config.web.token_file)
+    token = read_or_make_token(path)
 
     _serve(config.web, socket_path(socket or config.api.socket), token, path, as_json=as_json)
     return 0

@@ -67,14 +67,15 @@ class WayBack:
 
     A controller that takes another target in mid-motion sets out before anybody knows where focus was to the
     micrometre, is told while it goes, and turns without resting: a turn takes no time but that of the ramps. The
-    others rest before every move.
+    others rest before every move. It goes as fast as the lens can, unless it is to make as many events as another way
+    of *speed_um_s* did.
     """
 
-    def __init__(self, stage: Stage, settings: CycleSettings, sign: int) -> None:
+    def __init__(self, stage: Stage, settings: CycleSettings, sign: int, speed_um_s: float | None = None) -> None:
         self._stage = stage
         self._sign = sign
         self._backlash_um = settings.backlash_um
-        self._speed_um_s = stage.to_um(stage.parts.lens.limits.max_speed_sps)
+        self._speed_um_s = stage.to_um(stage.parts.lens.limits.max_speed_sps) if speed_um_s is None else speed_um_s
         self._in_flight = stage.parts.lens.capabilities.native_velocity
         self._aim_um: float | None = None
 

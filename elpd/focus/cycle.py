@@ -15,10 +15,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
-from elpd.focus import guards, judging, safety, second_pass
+from elpd.focus import guards, judging, recross, safety
 from elpd.focus.approach import WayBack, come_to_rest, verify
 from elpd.focus.ended import Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR, expose
+from elpd.focus.passes import Play
 from elpd.focus.picture import Picture
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
@@ -180,9 +181,9 @@ class FocusCycle:
         ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
         first, furthest_um = watch.estimate(), ended.um
-        if second_pass.is_needed(watch):
+        if recross.is_needed(watch):
             first, furthest_um = self._pass_again(watch, first, sign)
-            way = WayBack(self._stage, self._settings, sign)
+            way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
         estimate = self._judge(watch, first, sign, (passed.begun_um, furthest_um))
         self._phase(Phase.RETURN)
         rest = way.arrive(estimate.focus_um)
@@ -255,7 +256,9 @@ class FocusCycle:
             reference,
             roi,
             geometry,
-            WatchSettings(settings.speed_um_s, settings.depth_of_focus_um, frames=frames),
+            WatchSettings(
+                settings.speed_um_s, settings.depth_of_focus_um, Play.up_to(settings.backlash_um), frames=frames
+            ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
             sensor,
@@ -303,13 +306,11 @@ class FocusCycle:
             self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
     def _pass_again(self, watch: Watch, first: FocusEstimate | None, sign: int) -> tuple[FocusEstimate | None, float]:
-        """Pass focus a second time; return what both passes say and where the lens is then."""
+        """Go over focus again; return what all passes say and the furthest place."""
         self._phase(Phase.RECROSS)
-        limit_um = judging.limit_um(self._settings)
-        focus_um, sigma_um = (watch.peak_um, limit_um) if first is None else (first.focus_um, first.sigma_um)
-        self._sink.note("one pass", focus_um=focus_um, sigma_um=None if first is None else sigma_um)
-        rest = second_pass.pass_again(self._stage, watch, self._settings, focus_um, sigma_um, sign)
-        return watch.estimate(), self._stage.to_um(rest.steps)
+        if first is not None:
+            self._sink.note("one pass", focus_um=first.focus_um, sigma_um=first.sigma_um)
+        return recross.pass_again(self._stage, watch, self._settings, first, sign, self._deadline_ns)
 
     def _judge(
         self, watch: Watch, estimate: FocusEstimate | None, sign: int, way_um: tuple[float, float]
@@ -415,6 +416,7 @@ class FocusCycle:
         told = [*self._warnings, *guards.of_loss(self._stage.lost_events)]
         if self._watch is not None:
             told += guards.of_marks(self._stage.marks)
+            told += guards.of_shedding(self._watch.shedding.shed_us)
             roi, frame = self._watch.roi, self._stage.frame
             told += guards.of_rate(self._watch.rate.plateau_mev_s())
             told += guards.of_frame(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,17 +19,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import FocusEstimate
-    from elpd.vision.crossing import Witness
+    from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
+    from elpd.vision.refractory import Refractory
 
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
 
-VERTEX_IN_MOTION_PER_MS = 0.003
-"""What a scene that moves adds to the error of the events' vertex, in widths of the curve, for each millisecond that
-the pass over the curve took: what leaves the region and enters it tilts the curve, and thresholds that differ between
-pixels add up. Thirty shaken scenes strayed by 0.33 widths (root mean square) in 100 ms."""
+VERTEX_IN_MOTION = 0.012
+VERTEX_PER_PX = 0.012
+"""What a scene that moves adds to the error of the events' vertex, as a tilt of log S over one width of the curve, in a
+picture whose edges point in all directions: at all, because pixels follow motion as late as focus, and for each pixel
+that it goes, because of what leaves the region and enters it. The variance is in inverse proportion to the picture's
+isotropy: bricks and a rocket's tower stray three times as far as gravel."""
+
+LEAST_ISOTROPY = 0.05
+"""Below it all edges of a picture point one way, but for noise, and what is motion and what is blur nobody can tell."""
 
 FRAMES_IN_MOTION = 0.05
 """What scene motion adds to the error of the frames' vertex, in widths of the curve: the scene has depth and ends, and
@@ -43,6 +50,10 @@ class Testimony:
     depths: tuple[float, ...] = ()
     """Where planes of the region are in focus, if there are several, the first met first."""
     flicker: Flicker | None = None
+    deaf: Refractory | None = None
+    """How long pixels are deaf after an event, by its events."""
+    scene_moves: bool = False
+    """Whether the scene moved while it was passed over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,40 +70,57 @@ class Pass:
     width_um: float
     """The width that the curve of log S has in this optical system."""
     scene_moves: bool
+    deaf: Refractory | None = None
+    """How long pixels are deaf after an event, where another pass has said so: an error is then the same in both."""
 
     def testify(
         self, locate: Callable[[SensorUs], float], brightness: NDArray[np.float32], unexplained: float, dark: float
     ) -> Testimony:
         """Ask the events and frames of this pass.
 
-        What is unknown of the photoreceptors' lag shifts the events' answers by that time multiplied by this pass's
-        speed; passes at two speeds in one direction tell the two apart, whatever the backlash is (``crossing.fuse``).
         *unexplained* is the share of the lag that may be wrong, *dark* the dark current that *brightness* does not
         show (both as in ``vision.crossing``).
-        Where the scene is known to move, its turns make mirrors: pairs, and the depths they tell, are not asked.
+        Where the scene moves, its turns make mirrors: pairs, and what they tell of depths and lag, are not asked.
         """
         memory = self.memory
         if not len(memory.track):
             return Testimony(tuple(self.ask_frames(locate)))
         if self.end_us > memory.track.times_us[-1]:
             memory.advance(self.end_us, self.sign * locate(self.end_us))
-        deaf = memory.refractory()
+        deaf = memory.refractory() if self.deaf is None else self.deaf
         ruler = lens_path(locate, self.begun_us, self.end_us, self.sign)
         said = memory.ask(memory.track.times_us[-1], ruler, brightness, deaf.period_us, dark=dark)
         if said is None:
-            return Testimony(tuple(self.ask_frames(locate)))
-        speed_um_us = 1e-6 * self.speed_um_s
+            return Testimony(tuple(self.ask_frames(locate)), deaf=deaf)
+        undated_um = 1e-6 * self.speed_um_s * deaf.sigma_us
+        if not said.depths and (self.scene_moves or said.drift.seen):
+            witnesses = [*self.ask_frames(locate), *self._in_motion(said, undated_um)]
+            return Testimony(tuple(witnesses), (), memory.flicker(), deaf, scene_moves=True)
         witnesses = [
-            replace(one, shared=float(np.hypot(one.shared, deaf.sigma_us * speed_um_us)))
+            replace(one, shared=float(np.hypot(one.shared, undated_um)))
             for one in said.witnesses(unexplained, self.width_um)
         ]
-        if self.scene_moves:
-            strayed_um = self._strayed_um()
-            vertices = [one for one in witnesses if one.name == "vertex"]
-            witnesses = [replace(one, sigma=float(np.hypot(one.sigma, strayed_um))) for one in vertices]
-            return Testimony((*self.ask_frames(locate), *witnesses), flicker=memory.flicker())
         frames = [] if said.depths else self.ask_frames(locate)  # of several planes frames show a mixture
-        return Testimony((*frames, *witnesses), said.depths, memory.flicker())
+        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf)
+
+    def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
+        """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
+        if said.image is None or said.drift.isotropy < LEAST_ISOTROPY:
+            return []
+        lag = said.expected_lag
+        # A tilt of a parabola moves its vertex by the square of its width.
+        tilt = (VERTEX_IN_MOTION + VERTEX_PER_PX * said.drift.px) / sqrt(said.drift.isotropy)
+        strayed_um = tilt * said.image.finest.width**2 / self.width_um
+        return [
+            replace(
+                one,
+                at=one.at + said.lag.at - lag.at,
+                sigma=float(np.hypot(one.sigma, strayed_um)),
+                shared=float(np.hypot(lag.sigma, undated_um)),
+            )
+            for one in said.witnesses(width=self.width_um)
+            if one.name == "vertex"
+        ]
 
     def testify_under_a_lamp(self, locate: Callable[[SensorUs], float], window_us: float) -> Testimony:
         """Ask the curve of whole lamp periods, one point each *window_us*, and the frames."""
@@ -113,42 +141,72 @@ class Pass:
             witness = replace(witness, sigma=float(np.hypot(witness.sigma, doubt)))
         return [witness] if np.isfinite(witness.sigma) else []
 
-    def _strayed_um(self) -> float:
-        """Return what a moving scene adds to the error of the events' vertex."""
-        begin_us = max(self.begun_us, int(self.end_us - 1e6 * 2.0 * self.width_um / self.speed_um_s))
-        return VERTEX_IN_MOTION_PER_MS * self.width_um * (self.end_us - begin_us) / 1000.0
+
+@dataclass(frozen=True, slots=True)
+class Play:
+    """How far the carriage lies behind the motor after a turn, and one standard error."""
+
+    um: float
+    sigma_um: float
+
+    @classmethod
+    def up_to(cls, most_um: float) -> Play:
+        """Return what is known of a play of which only an upper bound is: evenly anything below it."""
+        return cls(0.5 * most_um, most_um / sqrt(12.0))
+
+
+NO_PLAY = Play(0.0, 0.0)
 
 
 class Passes:
-    """What the passes over focus in one direction have testified together."""
+    """What the passes over focus have testified together; the direction of the first, the sweep, is the ruler's."""
 
     def __init__(self) -> None:
-        self._said: list[Testimony] = []
+        self._said: list[tuple[Testimony, int]] = []
         self._near_us: list[tuple[float, float]] = []
-        self.depths: tuple[float, ...] = ()
+        self.depths_um: tuple[float, ...] = ()
+        """Where planes of the region are in focus, if a pass told several, on the motor's ruler."""
         self.flicker: Flicker | None = None
+        self.scene_moves = False
+        """Whether any of them saw the scene move."""
+        self.deaf: Refractory | None = None
+        """How long pixels are deaf after an event, by the first of them."""
 
-    def add(self, said: Testimony, near_us: tuple[float, float]) -> None:
-        """Take what a pass says, and from when to when it was near focus."""
-        self._said.append(said)
+    def add(self, said: Testimony, sign: int, near_us: tuple[float, float]) -> None:
+        """Take what a pass of direction *sign* says, and from when to when it was near focus."""
+        self._said.append((said, sign))
         self._near_us.append(near_us)
-        self.depths = said.depths or self.depths
+        self.depths_um = tuple(sign * at for at in said.depths) or self.depths_um
         self.flicker = said.flicker or self.flicker
+        self.scene_moves |= said.scene_moves
+        self.deaf = self.deaf or said.deaf
+
+    @property
+    def sign(self) -> int:
+        """Direction of the sweep; 0 before it is over."""
+        return self._said[0][1] if self._said else 0
 
     def hold_any(self, times_us: Sequence[int]) -> bool:
         """Say whether any of the times was near focus."""
         return any(begin <= when <= end for begin, end in self._near_us for when in times_us)
 
-    def estimate(self, sign: int) -> FocusEstimate | None:
-        """Return where focus is, on the motor's ruler, of passes whose places rose with *sign* times it."""
-        found = fuse([witness for said in self._said for witness in said.witnesses])
+    def estimate(self, play: Play) -> FocusEstimate | None:
+        """Return where focus is, on the motor's ruler, while the carriage is pushed in the sweep's direction."""
+        sweep = self.sign
+        found = fuse(
+            [
+                one if sign == sweep else one.on_the_way_back(play.um, play.sigma_um)
+                for said, sign in self._said
+                for one in said.witnesses
+            ]
+        )
         if found is None:
             return None
         return replace(
             found,
             method="two_crossings" if len(self._said) > 1 else found.method,
-            focus_um=sign * found.focus_um,
-            contributions=tuple((name, sign * at, sigma, share) for name, at, sigma, share in found.contributions),
+            focus_um=sweep * found.focus_um,
+            contributions=tuple((name, sweep * at, sigma, share) for name, at, sigma, share in found.contributions),
         )
 
 

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from elpd.records import Roi, SensorProfile
 
 
+MAX_SIGMA_DOF = 0.5
+"""The standard error, in depths of focus, above which there is no FOCUSED unless a configuration says otherwise."""
+
+
 @dataclass(frozen=True, slots=True)
 class CycleSettings:
     """The numbers of one rig and one taste; see ``elpd.config`` for what each means."""
@@ -24,7 +28,7 @@ class CycleSettings:
     deadline_ms: float = 5000.0
     max_travel_um: float = 1500.0
     max_reversals: int = 2
-    max_sigma_dof: float = 0.5
+    max_sigma_dof: float = MAX_SIGMA_DOF
     on_failure: Literal["hold", "start", "preset"] = "start"
     preset_um: float | None = None
     transmittance: Literal["profile", "linear", "iris"] = "profile"

@@ -18,8 +18,9 @@ from elpd.events.stream import PacketDecoder
 from elpd.focus.frame_track import FrameTrack
 from elpd.focus.heading import Heading
 from elpd.focus.lamplight import Lamplight, weighed
-from elpd.focus.passes import Pass, Passes
+from elpd.focus.passes import NO_PLAY, Pass, Passes, Play
 from elpd.focus.placed import Placed
+from elpd.focus.shedding import Shedding
 from elpd.records import Direction
 from elpd.units import SensorUs
 from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
@@ -81,6 +82,8 @@ class WatchSettings:
 
     speed_um_s: float
     depth_of_focus_um: float
+    play: Play = NO_PLAY
+    """Between motor and carriage."""
     frames: bool = False
     """Whether the reference is a frame, whose bright and dark are blurred, and not a temporal map."""
 
@@ -133,6 +136,8 @@ class Watch:
         """What the sensor says at rest."""
         self.rate = RateWatch()
         """Whether the read-out is full."""
+        self.shedding = Shedding(roi, geometry)
+        """What of a sweep is not looked at when there is too much of it."""
         self._lamp: Lamplight | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
@@ -149,8 +154,8 @@ class Watch:
         self._begun_us = SensorUs(0)
         self._judge_from = float("-inf")
         self._samples: list[ElpSample] = []
-        self._frames = FrameTrack(self.roi, follow=self.scene_moves)
         self._passes = Passes()
+        self._frames = FrameTrack(self.roi, follow=self.scene_moves)
         self._unheard: list[CameraPacket] = []
         self.decided_us: SensorUs | None = None
         """When the window that decided was complete, on the sensor's clock."""
@@ -203,8 +208,8 @@ class Watch:
 
     @property
     def scene_moves(self) -> bool:
-        """Whether the scene moved while the lens stood still."""
-        return self.resting.moves
+        """Whether the scene was seen to move, while the lens stood still or when focus was passed."""
+        return self.resting.moves or self._passes.scene_moves
 
     @property
     def frame_period_us(self) -> float | None:
@@ -257,15 +262,18 @@ class Watch:
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
             sample = self._net(self._placed.sample(row))
+            duration_us = sample.end_us - sample.begin_us
+            if self.shedding.shed_us:
+                sample = replace(sample, shed_us=self.shedding.within(sample.begin_us, sample.end_us))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
-            duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
             ticked = self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
-            self._heading.feed(sample, self._memory, ticked=ticked)
+            if 2 * sample.shed_us < duration_us:  # a window that was hardly looked at says nothing
+                self._heading.feed(sample, self._memory, ticked=ticked)
             far = self._memory.track.drop > FAR_DROP
             if self._heading.seen_ahead and not self._passed and far and self._memory.peak_passed:
                 self._passed = True
@@ -365,6 +373,7 @@ class Watch:
             self._settings.speed_um_s,
             WIDTHS_PER_DEPTH_OF_FOCUS * self._settings.depth_of_focus_um,
             self.scene_moves,
+            self._passes.deaf,
         )
         if self._lamp is not None:
             said = one.testify_under_a_lamp(self._locate, self._window_us)
@@ -372,10 +381,10 @@ class Watch:
             dark = DARK if self._settings.frames else DARK_OF_MAP
             said = one.testify(self._locate, self._reference.brightness, LAG_UNEXPLAINED_LIVE, dark)
         look_back_us = 1e6 * LOOK_BACK_DOF * self._settings.depth_of_focus_um / self._settings.speed_um_s
-        self._passes.add(said, (self.decided_us - look_back_us, self.decided_us))
+        self._passes.add(said, self._sign, (self.decided_us - look_back_us, self.decided_us))
         self.flicker = self._passes.flicker
-        self.depths_um = tuple(self._sign * at for at in self._passes.depths)
-        return self._passes.estimate(self._sign)
+        self.depths_um = self._passes.depths_um
+        return self._passes.estimate(self._settings.play)
 
     @property
     def peak_um(self) -> float:
@@ -389,7 +398,7 @@ class Watch:
         return self._passes.hold_any(self._gaps_us)
 
     def events_within(self, from_um: float, to_um: float) -> int:
-        """Return how many events the sweep saw between two places."""
+        """Return how many events the last pass in the sweep's direction saw between two places."""
         low, high = min(from_um, to_um), max(from_um, to_um)
         return sum(one.n_on + one.n_off for one in self._samples if low <= one.position_um <= high)
 
@@ -446,13 +455,15 @@ class Watch:
             self.keep(packet)
         self._unheard = []
 
-    def begin_again(self, speed_um_s: float, at_us: SensorUs, from_um: float) -> None:
-        """Begin to pass focus a second time, in the same direction, at another speed.
+    def begin_again(self, sign: int, at_us: SensorUs, from_um: float) -> None:
+        """Begin to pass focus once more, in either direction.
 
         The image is gone on with; its sharpness is followed from *from_um* on, where the play has been taken up.
         """
         self._remember(self._memory.built())
-        self._settings = replace(self._settings, speed_um_s=speed_um_s)
+        self._sign = sign
+        if sign == self._passes.sign:
+            self._samples = []
         self._ticked_um = self._here_um = float("nan")
         self._begun_us, self._judge_from = at_us, self._sign * from_um
         self._turned_us = FOR_EVER
@@ -464,6 +475,8 @@ class Watch:
         self.keep(packet)
         for row in self._windows.feed(packet):
             sample = self._placed.sample(row)
+            if self._sign == self._passes.sign:
+                self._samples.append(sample)
             self.events_in_cycle += sample.n_on + sample.n_off
             end_um = sample.position_um + 0.5 * sample.travel_um
             if sample.begin_us >= self._begun_us and self._sign * end_um >= self._judge_from:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.focus import guards
+from elpd.focus.settings import MAX_SIGMA_DOF
 from elpd.records import Direction, FocusEstimate, Outcome
 from elpd.vision.crossing import (
     ROI_MARGIN_PX,
@@ -48,9 +49,6 @@ _FRAMES_AFTER_US = 50_000
 """Frames this long after the last event still belong to the record; later ones show what no event has seen."""
 _START_US = 1_000
 """A frame this shortly after the first event still shows what the events began from."""
-
-MAX_SIGMA_DOF = 0.5
-"""The standard error, in depths of focus that the caller told, above which there is no FOCUSED."""
 
 _PATIENT_DROP = 0.2
 """Frames that have passed their peak wait this long, in log S, for ELP to change its sign too."""
@@ -96,6 +94,8 @@ class SweepSearch:
         A picture that is there from the start.
     sensor:
         What a calibration knows of the sensor.
+    max_sigma_dof:
+        The standard error, in depths of focus that the caller told, above which there is no FOCUSED.
     """
 
     def __init__(
@@ -108,8 +108,10 @@ class SweepSearch:
         begin_us: int | None = None,
         reference: Reference | None = None,
         sensor: SensorProfile | None = None,
+        max_sigma_dof: float = MAX_SIGMA_DOF,
     ) -> None:
         self._sweep = sweep
+        self._max_sigma_dof = max_sigma_dof
         self._roi = roi
         self._ruler = ruler
         self._depth_of_focus_um = depth_of_focus_um if ruler.in_um else None
@@ -242,7 +244,7 @@ class SweepSearch:
         # A depth of focus that was told is kept to as in a cycle; one that is read off the curve is itself rough.
         limit = self._width_of(witnesses) / WIDTHS_PER_DEPTH_OF_FOCUS
         if self._depth_of_focus_um is not None:
-            limit = MAX_SIGMA_DOF * self._depth_of_focus_um
+            limit = self._max_sigma_dof * self._depth_of_focus_um
         return self._decide(estimate, limit, now_us)
 
     def _image_peak_passed(self) -> bool:

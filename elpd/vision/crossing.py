@@ -10,7 +10,7 @@ here depends on scene, optics or speed. Witnesses that disagree beyond their err
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -18,6 +18,7 @@ import numpy as np
 
 from elpd.records import FocusEstimate
 from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
+from elpd.vision.drift import Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
 from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
@@ -111,19 +112,29 @@ _STATIC_SHARE = 0.97
 class Witness:
     """One estimator's answer, on the caller's ruler.
 
-    ``sigma`` is its own standard error; ``shared`` one that all witnesses of its kind have in common, with one sign:
-    what is not known of the photoreceptors' lag makes every event late.
+    ``sigma`` is its own standard error. The others it has in common with its kind, each with its sign: ``shared`` is
+    what is not known of the photoreceptors' lag, which makes every event late; ``held`` what is not known of how late
+    the image is because pixels hold back; ``play`` what is not known of the play between motor and carriage.
     """
 
     name: str
     at: float
     sigma: float
     shared: float = 0.0
+    held: float = 0.0
+    play: float = 0.0
 
     @property
     def total_sigma(self) -> float:
-        """Both errors together."""
-        return float(np.hypot(self.sigma, self.shared))
+        """All errors together."""
+        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play]))
+
+    def on_the_way_back(self, play: float, play_sigma: float) -> Witness:
+        """Return what a pass in the opposite direction said, on the ruler of the sweep.
+
+        What was late lies to the other side there, and the carriage is behind the motor by the *play*.
+        """
+        return replace(self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +153,10 @@ class EventWitnesses:
     those of the first, and there is no image: sharpness shows none of them."""
     plane_width: float = 0.0
     """Width of one plane's curve, as far as its rising flank tells, where there are several."""
+    drift: Drift = field(default_factory=Drift)
+    """How far the scene went across the sensor meanwhile."""
+    expected_lag: Lag = field(default_factory=Lag)
+    """What the image would have been freed of if no pair had been asked."""
 
     def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
@@ -159,9 +174,9 @@ class EventWitnesses:
         departure = 0.0
         if self.image is not None:
             departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
-            own = (SYSTEMATIC_IMAGE + IMAGE_IN_MOTION * stray) * (1.0 + HELD_BACK * self.held_back)
-            sigma = float(np.hypot(self.image.sigma, own * width))
-            found.append(Witness("vertex", self.image.at, sigma, shared))
+            dull = (1.0 + HELD_BACK * self.held_back) * width
+            sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray * dull))
+            found.append(Witness("vertex", self.image.at, sigma, shared, SYSTEMATIC_IMAGE * dull))
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
             systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
             found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
@@ -194,6 +209,8 @@ def ask_events(
     *brightness* does not show, relative to the brightest parts.
     """
     weight, slowness = _by_brightness(brightness, events, dark)
+    if brightness is None and calibrated is not None:
+        calibrated = calibrated.unseen()
     groups = by_pixel(events)
     at_peak = rebuilt(events, groups, np.array([peak]))[0]
     slownesses = _slownesses(start, at_peak, slowness)
@@ -212,6 +229,7 @@ def ask_events(
     pixels = max(1, events.height * events.width)
     ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
     images = rebuilt(events, groups, ticks)
+    drift = find_drift(images)
     first = _image_focus(_curves(images, None, weight, events.margin)[0], ticks, peak)
     curves = [] if _stray(pairs) < STILL else _curves(images, start, weight, events.margin)
     hush(images, ticks, events, peak if first is None else first.finest.at)
@@ -219,15 +237,18 @@ def ask_events(
     candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
     image = average_focus(candidates) if candidates else None
     energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
-    lags = late.candidates
+    lags, expected = late.candidates, late.typical
     if energy.any():
         typical = [float(np.average(slow, weights=energy)) for slow in slownesses]
+        unasked = _lag_of(None, unmeasured_lag / typical[0], calibrated)
+        expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
     lag = average_lag(lags, late.weights)
     if image is not None:
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
-    return EventWitnesses(image, pairs, lag, LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12))
+    held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
+    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected)
 
 
 def _by_brightness(
@@ -320,8 +341,8 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     if not witnesses:
         return None
     at = np.array([one.at for one in witnesses])
-    shared = np.array([one.shared for one in witnesses])
-    covariance = np.diag([one.sigma**2 for one in witnesses]) + np.outer(shared, shared)
+    common = np.array([(one.shared, one.held, one.play) for one in witnesses])
+    covariance = np.diag([one.sigma**2 for one in witnesses]) + common @ common.T
     precision = np.linalg.inv(covariance)
     share = precision.sum(axis=0) / precision.sum()
     focus = float(share @ at)

@@ -16,10 +16,16 @@ from elpd.events.evt3_lanes import AHEAD, LISTS, LOWS, take_blocks, take_change_
 from elpd.events.jit import kernel
 from elpd.events.lanes import available, weigh
 from elpd.events.registers import HIGH, LOOP, LOW
-from elpd.vision import elp_words
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import BEGIN, ELP, ENERGY, LENGTH, N_OFF, N_ON, OUT_OF_SENSOR, OUTSIDE, move_to
-from elpd.vision.elp_words import PENDING, SIGNATURE, sum_capped, sum_pending
+from elpd.vision.elp_words import (
+    PENDING,
+    SIGNATURE,
+    evt3_to_windows,
+    evt3_to_windows_capped,
+    sum_capped,
+    sum_pending,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,11 +57,9 @@ else:
 
 
 def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
-    take = take_timed_blocks if capped else take_blocks
-    scalar = elp_words.evt3_to_windows_capped if capped else elp_words.evt3_to_windows
-
+    # Kernels are named below and not closed over, because numba's cache cannot know a kernel in a closure again.
     @kernel(SIGNATURE)
-    def evt3_to_windows(
+    def evt3_to_windows_by_blocks(
         words: NDArray[np.uint16],
         position: int,
         state: NDArray[np.int64],
@@ -82,12 +86,15 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile
             since = window[BEGIN] - base
             low_from = min(max(since, 0), LOWS_IN_HIGH)
             low_until = min(max(since + window[LENGTH], low_from), LOWS_IN_HIGH)
-            position, n, stopped = take(
-                words, position, state, triggers, low_from, low_until, last_row, STRIDE, lists, ledger
-            )
             if capped:
+                position, n, stopped = take_timed_blocks(
+                    words, position, state, triggers, low_from, low_until, last_row, STRIDE, lists, ledger
+                )
                 sum_capped(lists, lists, LOWS, base, n, table, window, bucket)
             else:
+                position, n, stopped = take_blocks(
+                    words, position, state, triggers, low_from, low_until, last_row, STRIDE, lists, ledger
+                )
                 sum_list(lists, n, table, window)
             if not stopped:
                 continue
@@ -97,17 +104,21 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile
             t = base + state[LOW]
             if np.uint64(t - window[BEGIN]) >= np.uint64(window[LENGTH]) and not move_to(t, window, edges, rows):
                 return position
-        return scalar(
+        if capped:
+            return evt3_to_windows_capped(
+                words, position, state, triggers, table, window, edges, rows, complete_until_us, bucket, lists, ledger
+            )
+        return evt3_to_windows(
             words, position, state, triggers, table, window, edges, rows, complete_until_us, bucket, lists, ledger
         )
 
-    return evt3_to_windows
+    return evt3_to_windows_by_blocks
 
 
 def kernels() -> tuple[Callable[..., int], Callable[..., int]]:
     """Return the fastest fused EVT3 kernels for this processor: without and with the rate cap."""
     if not available():
-        return elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped
+        return evt3_to_windows, evt3_to_windows_capped
     return _evt3_to_windows, _evt3_to_windows_capped
 
 

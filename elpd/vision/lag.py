@@ -31,6 +31,10 @@ UNMEASURED_LAG_US = 1_000.0
 DECADES = 0.5
 """One standard deviation of its logarithm to base ten: a tenth of the lag above in sunlight, tenfold in the dark."""
 
+TYPICAL_SLOWNESS, SPREAD = 4.8, 3.4
+"""How many times slower than the brightest a pixel is, mean and standard deviation, where no picture tells: evenly
+spread over the powers of ten between one and what dark current leaves of the light (``crossing.DARK``)."""
+
 OTHER_LIGHT = 0.5
 """How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
 
@@ -70,6 +74,10 @@ class LagPrior:
             return None
         sigma_us = max(1.0, sqrt(sensor.lag_sigma_us**2 + (OTHER_LIGHT * sensor.lag_us) ** 2))
         return cls(sensor.lag_us * speed_um_us, sigma_us * speed_um_us)
+
+    def unseen(self) -> LagPrior:
+        """Return the same for a typical pixel of a picture that nobody has seen."""
+        return LagPrior(TYPICAL_SLOWNESS * self.at, float(np.hypot(TYPICAL_SLOWNESS * self.sigma, SPREAD * self.at)))
 
     def with_line(self, measured: Line | None) -> Lag:
         """Average what the pairs' classes say and what the calibration does, by their errors; not below zero."""

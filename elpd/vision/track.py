@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from elpd.vision.bands import band_energies, focus_of_bands
+from elpd.vision.drift import shift_px
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
@@ -214,9 +215,8 @@ class FrameEnergy:
             return inside
         band = cv2.GaussianBlur(levels, (0, 0), FOLLOW_PX) - cv2.GaussianBlur(levels, (0, 0), 4 * FOLLOW_PX)
         if self._before is not None:
-            window = cv2.createHanningWindow((band.shape[1], band.shape[0]), cv2.CV_32F)
-            step, _ = cv2.phaseCorrelate(self._before, np.asarray(band, np.float32), window)
-            self._shift_px = np.clip(self._shift_px + np.array(step), -self._margin, self._margin)
+            step = shift_px(self._before, np.asarray(band, np.float32))
+            self._shift_px = np.clip(self._shift_px + step, -self._margin, self._margin)
         self._before = np.asarray(band, np.float32)
         shift = np.array([[1.0, 0.0, self._shift_px[0]], [0.0, 1.0, self._shift_px[1]]])
         return np.asarray(cv2.warpAffine(inside, shift, (inside.shape[1], inside.shape[0])), np.float32)

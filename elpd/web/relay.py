@@ -16,7 +16,7 @@ import secrets
 from collections import deque
 from contextlib import aclosing
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import structlog
 
@@ -24,7 +24,7 @@ from elpd.client.aio import AsyncClient
 from elpd.errors import ElpdError
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Mapping
+    from collections.abc import AsyncGenerator, Coroutine, Mapping
     from pathlib import Path
 
 RING_EVENTS = 4096
@@ -127,7 +127,8 @@ class Relay:
 
     async def _listen(self, client: AsyncClient) -> None:
         """Hear events until the daemon goes, which raises."""
-        async with aclosing(client.events(rate_hz=SAMPLE_RATE_HZ)) as events:
+        told = cast("AsyncGenerator[Mapping[str, Any], None]", client.events(rate_hz=SAMPLE_RATE_HZ))
+        async with aclosing(told) as events:
             async for event in events:
                 self._hear(event)
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from elpd.errors import ConfigError
 
 TOKEN_BYTES = 32
+SERVICE_TOKEN = Path("/var/lib/elpd-web/web.token")
+"""Where ``elpd-web.service`` keeps its own."""
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{40,200}")
 
 
@@ -35,7 +37,7 @@ def read_or_make_token(path: Path) -> str:
     Raises ``ConfigError`` if the file belongs to somebody else, can be read by others, or holds something else.
     """
     try:
-        return _read(path)
+        return _read(path, {os.geteuid()})
     except FileNotFoundError:
         pass
     except OSError as error:
@@ -45,12 +47,28 @@ def read_or_make_token(path: Path) -> str:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         _create(path, token)
     except FileExistsError:
-        return _read(path)  # another gateway was faster
+        return _read(path, {os.geteuid()})  # another gateway was faster
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror or error}; set web.token_file to a place that can be written"
         ) from None
     return token
+
+
+def read_token(configured: Path | None) -> tuple[str, Path]:
+    """Return the token of a gateway that runs, and its file: the user's own, else the service's, which root may read.
+
+    Raises ``ConfigError`` if there is none, or it is not to be trusted.
+    """
+    own = token_path(configured)
+    for path in [own] if configured is not None else [own, SERVICE_TOKEN]:
+        try:
+            return _read(path, trusted_uids={os.geteuid()} if os.geteuid() else None), path
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror or error}; ask as the user whom it belongs to") from None
+    raise ConfigError(f"{own}: there is no token yet; start `elpd web`, which makes it")
 
 
 def _create(path: Path, token: str) -> None:
@@ -65,12 +83,13 @@ def _create(path: Path, token: str) -> None:
         temporary.unlink()
 
 
-def _read(path: Path) -> str:
+def _read(path: Path, trusted_uids: set[int] | None) -> str:
+    """Read a private file of one of these users, or (``None``) of anybody's."""
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     with os.fdopen(handle, encoding="ascii", errors="replace") as file:
         facts = os.fstat(file.fileno())
         mode = stat.S_IMODE(facts.st_mode)
-        if facts.st_uid != os.geteuid() or mode & 0o077:
+        if mode & 0o077 or (trusted_uids is not None and facts.st_uid not in trusted_uids):
             raise ConfigError(
                 f"{path}: mode {mode:04o}, owner {facts.st_uid}; a token file must be 0600 and belong to user "
                 f"{os.geteuid()}: delete it, and a new one is made"

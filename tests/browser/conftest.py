@@ -84,8 +84,9 @@ class Opener:
             context.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """Launch one for a module, not for all: while Playwright's loop runs, no other test could run its own."""
     with launched("--host-resolver-rules=MAP rebound.test 127.0.0.1") as browser:
         yield browser
 

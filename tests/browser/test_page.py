@@ -219,6 +219,35 @@ def test_a_stop_that_does_not_get_through_says_so_and_stays(opened: Opener, rig:
     expect(page.locator(".trouble")).to_contain_text("rig's own switch")
 
 
+def test_stop_finds_a_way_past_commands_and_pictures_that_nobody_answers(opened: Opener, rig: Rig) -> None:
+    opened.expected = (REFUSED,)
+    page = opened()
+    rig.put(silent={"jog", "map", "run", "runs"})
+    page.check("[name=kind][value=events]", force=True)
+    rig.asked_for("map", rig.count("map") + 1)
+    for nth in range(2):
+        page.click("#jog button[value='1']")
+        rig.asked_for("jog", nth + 1)
+    page.click("#jog button[value='1']")
+    expect(page.locator(".trouble")).to_contain_text("Two commands are under way")
+    page.keyboard.press("Escape")
+    rig.asked_for("stop")
+    assert rig.count("jog") == 2
+
+
+def test_a_tab_in_the_background_lets_go_and_comes_back(opened: Opener, rig: Rig) -> None:
+    page = opened()
+    hide = "(hidden) => { Object.defineProperty(document, 'hidden', { value: hidden, configurable: true }); }"
+    page.evaluate(hide, True)
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    expect(page.locator("#link-text")).to_have_text("offline")
+    rig.phase("probe")
+    page.evaluate(hide, False)
+    page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    expect(page.locator("#link-text")).to_have_text("live")
+    expect(page.locator("#phase-now")).to_have_text("Setting out: which way is focus?")
+
+
 # --- connection, faults, rights --------------------------------------------------------------------------------------
 
 

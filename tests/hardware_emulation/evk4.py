@@ -52,11 +52,15 @@ class Evk4:
         self._answer_then = False
         self._serial = bytes.fromhex(serial)[::-1]
         self._replies: deque[bytes] = deque()
-        self._stream: deque[bytes] = deque()
+        self._stream: deque[bytes | None] = deque()
 
     def send(self, packet: bytes) -> None:
         """Queue a USB packet of events; one that is longer than the host asks for goes in several."""
         self._stream.append(packet)
+
+    def stall(self) -> None:
+        """Let the next request for events fail, as an endpoint does that has lost its way."""
+        self._stream.appendleft(None)
 
     def answer_when_sent(self) -> None:
         """Answer frames again once the host has taken every packet of events."""
@@ -106,6 +110,8 @@ class Evk4:
         if not self._stream or not self.streaming:
             return None
         packet = self._stream.popleft()
+        if packet is None:
+            raise BrokenPipeError
         if len(packet) > length:
             self._stream.appendleft(packet[length:])
         return packet[:length]

@@ -63,7 +63,7 @@ class Device(Protocol):
         ...
 
     def next_packet(self, endpoint: int, length: int) -> bytes | None:
-        """Return what to send now, ``None`` for nothing yet."""
+        """Return what to send now, ``None`` for nothing yet; ``BrokenPipeError`` stalls the endpoint."""
         ...
 
 
@@ -264,7 +264,10 @@ class _OpenDevice:
                 if time.monotonic() - self._active < QUEUED_S:
                     continue
                 self._flowing.add(endpoint)
-            packet = self._device.next_packet(endpoint, urb.length)
+            try:
+                packet = self._device.next_packet(endpoint, urb.length)
+            except BrokenPipeError:
+                return waiting.popleft(), -errno.EPIPE, b""
             if packet is not None:
                 return waiting.popleft(), 0, packet
         return None

@@ -43,8 +43,11 @@ SHM = Path("/dev/shm")  # noqa: S108  (looked at, not written to)
 
 
 @contextmanager
-def opened(ring_mb: float = 4.0, max_delay_ms: float = 0.0, **script: Any) -> Iterator[CapturedCamera]:
-    common = CaptureSettings(ring_mb=ring_mb, max_delay_ms=max_delay_ms)
+def opened(
+    ring_mb: float = 4.0, max_delay_ms: float = 0.0, hang_ms: float = 10_000.0, **script: Any
+) -> Iterator[CapturedCamera]:
+    """Open a scripted camera; a machine that is too busy for it is no hang, unless the test is about hangs."""
+    common = CaptureSettings(ring_mb=ring_mb, max_delay_ms=max_delay_ms, hang_ms=hang_ms)
     camera = open_captured(scripted_source.WHERE, script, common, MonotonicClock())
     try:
         yield camera
@@ -104,7 +107,7 @@ def test_what_it_can_do_is_what_its_source_can() -> None:
         assert (plain.min_latency_us, plain.serial) == (120.0, "0001")
         assert not isinstance(plain, (HardwareRoi, Biases, PixelMask, TriggerInput, RateLimit, Temperature))
     every = ("window", "biases", "mask", "trigger", "rate_limit", "temperature")
-    with opened(packets=0, abilities=every) as able:
+    with opened(hang_ms=100.0, packets=0, abilities=every) as able:
         assert isinstance(able, (HardwareRoi, Biases, PixelMask, TriggerInput, RateLimit, Temperature))
         able.set_window(Roi(1, 2, 3, 4))
         able.set_window(None)
@@ -118,7 +121,7 @@ def test_what_it_can_do_is_what_its_source_can() -> None:
         with pytest.raises(UsageError, match="does not fit the sensor of 346x260"):
             able.set_window(Roi(340, 0, 10, 10))
         able.start()
-        able.limit_rate(0.2)  # longer than a hang: what was asked for may take its time
+        able.limit_rate(0.2)  # longer than it may be silent: what was asked for may take its time
         assert able.read(0.0) is None
         with pytest.raises(CameraError, match="gone while it was told"):
             able.apply_biases(BiasSet.EXPOSE)
@@ -152,7 +155,8 @@ def test_stop_and_start_deliver_nothing_old() -> None:
 )
 def test_a_lost_camera_is_an_error_at_once_and_leaves_nothing_behind(how: str, reason: str, tmp_path: Path) -> None:
     before, named = children(), set(SHM.iterdir())
-    with opened(ends_at=20, how=how, once=str(tmp_path / "once"), every_s=0.0005) as camera:
+    hang_ms = 50.0 if how == "hang" else 10_000.0
+    with opened(hang_ms=hang_ms, ends_at=20, how=how, once=str(tmp_path / "once"), every_s=0.0005) as camera:
         mine = children() - before
         assert len(mine) == 1
         camera.start()
@@ -278,3 +282,14 @@ def test_the_child_ends_with_its_controller() -> None:
         assert process is not None
         process._control.close()
         assert process._child.wait(PATIENCE_S) == 0
+
+
+def test_a_child_that_is_told_to_end_gives_the_camera_back(tmp_path: Path) -> None:
+    with opened(closed=str(tmp_path / "note"), every_s=0.001) as camera:
+        camera.start()
+        process = camera._process
+        assert process is not None
+        process._child.terminate()
+        with pytest.raises(CameraError, match=r"its process ended with status 0; start it again"):
+            read_on(camera)
+        assert (tmp_path / "note").read_text() == "closed"

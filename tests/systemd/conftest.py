@@ -61,11 +61,15 @@ STRANGERS_DRIVERS = {
 }
 """A camera that sees nothing, and a Tic whose driver hangs in the process that /run/elpd/hang names."""
 
+BEFORE_OTHERS = "[Service]\nCPUSchedulingPolicy=rr\nCPUSchedulingPriority=1\n"
+"""The limits of the unit are of real time, and tests run beside other programs on few cores."""
+
 
 @pytest.fixture(scope="session")
 def machine() -> Iterator[booted.Booted]:
     if (missing := booted.why_not()) is not None:
         pytest.skip(missing)
     files, binds = booted.installation()
-    with booted.Booted(files | STRANGERS_DRIVERS, binds, booted.compiled_kernels()) as running:
+    files |= STRANGERS_DRIVERS | {"etc/systemd/system/elpd.service.d/before-others.conf": BEFORE_OTHERS}
+    with booted.Booted(files, binds, booted.compiled_kernels()) as running:
         yield running

@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from elpd.cli import COMMANDS
-
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Iterator
 
     from booted import Booted
 
-pytestmark = [
-    pytest.mark.xdist_group("systemd"),
-    pytest.mark.skipif("serve" not in COMMANDS, reason="there is no daemon in this version"),
-]
+pytestmark = pytest.mark.xdist_group("systemd")
 
 CONFIG = """
 rig = "hardware"
@@ -62,7 +57,8 @@ class Controller:
             "--set",
             "board.start_um=500",
         )
-        machine("systemd-run", "--unit=lens", "--property=User=elpd", *board)
+        properties = ("User=elpd", "CPUSchedulingPolicy=rr", "CPUSchedulingPriority=1")
+        machine("systemd-run", "--unit=lens", *(f"--property={each}" for each in properties), *board)
         told = machine.until(lambda: machine.journal("-u", "lens", "_TRANSPORT=stdout"), "the board's port")
         self.port = json.loads(told[0]["MESSAGE"])["port"]
         self.configure(CONFIG.format(port=self.port))
@@ -266,24 +262,34 @@ def test_a_wrong_configuration_at_the_start_ends_it_once_with_the_line(controlle
 
 
 def test_a_crash_loop_ends_and_the_lens_is_left_alone(controller: Controller) -> None:
+    machine, folder = controller.machine, "/run/systemd/system/elpd.service.d"
     where_um = controller.status()["lens"]["position_um"]
-    controller.machine("mkdir", "-p", "/run/systemd/system/elpd.service.d")
-    controller.machine.write(
-        "/run/systemd/system/elpd.service.d/crash.conf",
-        "[Service]\nExecStart=\nExecStart=/bin/sh -c 'kill -SEGV $$$$'\nRestartSec=10ms\n",
-    )
-    controller.machine("systemctl", "daemon-reload")
-    controller.machine("systemctl", "restart", "elpd", check=False)
-    controller.machine.until(lambda: controller.show("ActiveState") == ["failed"], "the end of the loop")
-    assert controller.show("Result", "NRestarts") == ["signal", "5"]
-    controller.machine("rm", "-r", "/run/systemd/system/elpd.service.d")
-    controller.machine("systemctl", "daemon-reload")
+    machine("mkdir", "-p", folder)
+    crash = "[Service]\nExecStart=\nExecStart=/bin/sh -c 'kill -SEGV $$$$'\nRestartSec=10ms\n"
+    machine.write(f"{folder}/crash.conf", crash)
+    try:
+        machine("systemctl", "daemon-reload")
+        machine("systemctl", "restart", "elpd", check=False)
+        machine.until(lambda: controller.show("ActiveState") == ["failed"], "the end of the loop")
+        assert controller.show("Result", "NRestarts") == ["signal", "5"]
+    finally:
+        machine("rm", "-r", folder)
+        machine("systemctl", "daemon-reload")
     controller.ready()
     assert controller.status()["lens"]["position_um"] == where_um
 
 
+def test_stopping_closes_the_socket_and_nothing_starts_it_again(controller: Controller) -> None:
+    controller.machine("systemctl", "stop", "elpd")
+    refused = controller.client("hello")
+    assert refused.communicate(timeout=120)[0] == ""
+    assert refused.returncode != 0
+    assert controller.show("ActiveState", "Result") == ["inactive", "success"]
+    assert controller.machine.show("elpd.socket", "ActiveState") == {"ActiveState": "inactive"}
+
+
 def test_kernels_are_kept_where_the_rest_is_read_only(controller: Controller) -> None:
-    listed = ("find", "/var/cache/elpd/numba", "-name", "*.nbi", "-printf", "%u %p\\n")
+    listed = ("find", "/var/cache/elpd/numba", "-name", "evt2.decode_*.nbi", "-printf", "%u %p\\n")
     before = controller.machine(*listed).stdout.splitlines()
     assert all(line.startswith("elpd ") for line in before)
     gone, damaged = (line.split()[1] for line in before[:2])

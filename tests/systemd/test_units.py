@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import booted
 import pytest
 
 if TYPE_CHECKING:
@@ -69,3 +70,15 @@ def test_udev_reads_the_rules(machine: Booted) -> None:
     told = machine("udevadm", "test", "/sys/devices/virtual/tty/ptmx", check=False)
     lines = [line for line in (told.stdout + told.stderr).splitlines() if "70-elpd.rules" in line]
     assert lines == ["Reading rules file: /etc/udev/rules.d/70-elpd.rules"]
+
+
+def test_a_booted_systemd_leaves_nothing_behind(machine: Booted) -> None:
+    del machine  # skips where none can be booted
+    mounts, cgroups = Path("/proc/mounts").read_bytes(), set(booted.cgroups().iterdir())
+    with booted.Booted({}, {}) as other:
+        assert other("cat", "/proc/1/comm").stdout == "systemd\n"
+        assert set(booted.cgroups().iterdir()) > cgroups
+        assert other.folder.exists()
+    assert not other.folder.exists()
+    assert Path("/proc/mounts").read_bytes() == mounts
+    assert not any(other.folder.name in path.name for path in booted.cgroups().iterdir())

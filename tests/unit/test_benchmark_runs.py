@@ -283,6 +283,8 @@ def test_the_first_direction_is_judged_by_where_focus_was() -> None:
     assert wrong([swept(0.0, 10.0, "behind")], 200.0) is True
     assert wrong([swept(0.0, 10.0, "behind")], -200.0) is False
     assert wrong([swept(0.0, 10.0, "passed")], -200.0) is True
+    assert wrong([swept(0.0, 900.0, "rule")], -200.0) is True
+    assert wrong([swept(0.0, 50.0, "rule")], 200.0) is False
     assert wrong([], 8.0) is None
     assert acceptance.stopped_early([swept(0.0, 100.0, "passed")], 110.0, 6.0)
     assert not acceptance.stopped_early([swept(0.0, 120.0, "passed")], 110.0, 6.0)

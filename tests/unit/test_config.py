@@ -2,6 +2,9 @@ import contextlib
 from pathlib import Path
 
 import pytest
+from elpd_drivers.cameras.davis import DavisSettings
+from elpd_drivers.cameras.neuromorphic_tables import NeuromorphicSettings
+from elpd_drivers.cameras.source import read_table
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,6 +26,13 @@ def test_without_a_file_the_rig_is_the_simulated_one() -> None:
 def test_a_shipped_rigs_lens_table_is_one_that_its_driver_reads(path: Path) -> None:
     with pytest.raises(LensError, match="no such port"):
         rig._open_lens(load(path).lens, MonotonicClock())
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*-*.toml")), ids=lambda path: path.name)
+def test_a_shipped_rigs_camera_table_is_one_that_its_driver_reads(path: Path) -> None:
+    camera = load(path).camera
+    tables = {"neuromorphic": NeuromorphicSettings, "davis": DavisSettings}
+    assert read_table(tables[camera.driver], camera.settings()).serial is None
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.name)

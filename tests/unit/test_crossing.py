@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import cv2
 import naive_vision
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from elpd.vision.bands import BandFocus, average_focus, band_energies, focus_of_bands
 from elpd.vision.crossing import Witness, frame_witness, fuse
+from elpd.vision.drift import find_drift
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
@@ -117,6 +119,36 @@ def test_disagreement_widens_the_error() -> None:
 def test_an_error_that_is_shared_does_not_average_out() -> None:
     many = [Witness(name, 0.0, 0.1, shared=3.0) for name in ("vertex", "pairs")]
     assert fuse(many).sigma_um == pytest.approx(3.0, rel=0.01)
+
+
+def test_there_and_back_what_is_late_cancels_and_only_the_play_is_left() -> None:
+    late, play = 7.0, 4.0
+    there = Witness("vertex", 50.0 + late, 1.0, shared=12.0, held=2.0)
+    back = Witness("vertex", -(50.0 - play) + late, 1.0, shared=12.0, held=2.0)
+    assert fuse([there]).sigma_um > 12.0
+    both = fuse([there, back.on_the_way_back(play, 1.0)])
+    assert both.focus_um == pytest.approx(50.0, abs=0.05)
+    assert both.sigma_um == pytest.approx(np.hypot(np.sqrt(0.5), 0.5), rel=0.05)
+    unknown = fuse([there, back.on_the_way_back(play, 8.0)])
+    assert unknown.sigma_um > 3.5, "a play that nobody measured is half an error of the answer"
+
+
+def test_images_of_a_scene_that_moved_lie_beside_each_other() -> None:
+    rng = np.random.default_rng(9)
+    for side in (100, 132, 135):  # transforms of even and of odd length
+        scene = cv2.GaussianBlur(rng.standard_normal((side + 8, side + 8)).astype(np.float32), (0, 0), 2.0)
+        still = np.stack([scene[4 : 4 + side, 4 : 4 + side] * gain for gain in (0.5, 0.8, 1.0, 0.9, 0.7)])
+        moved = np.stack([scene[4 : 4 + side, 4 - k : 4 - k + side] for k in (0, 1, 2, 3, 2)])
+        assert not find_drift(still).seen
+        found = find_drift(moved)
+        assert found.seen
+        assert found.px == pytest.approx(3.0, abs=0.2)
+        middle = (0.5 * scene.shape[1], 0.5 * scene.shape[0])
+        turns = [cv2.getRotationMatrix2D(middle, 0.0, gain) for gain in (1.0, 1.01, 1.02)]
+        grown = np.stack([cv2.warpAffine(scene, one, scene.shape[::-1], flags=cv2.INTER_CUBIC) for one in turns])
+        assert not find_drift(grown).seen, "what grows moves edges, and not the scene"
+        assert found.isotropy > 0.8
+        assert find_drift(np.repeat(moved[:, :1], side, axis=1)).isotropy < 0.01, "bars have edges of one direction"
 
 
 def test_frames_far_apart_are_trusted_less() -> None:

@@ -8,9 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from sensor_profiles import sensor_profile
 from shared import SHARED
 from sweep_world import picture, sweep
 
+from elpd.calibrate.profile import save
 from elpd.cli import main
 from elpd.record.layouts import RecordedSweep, read_sweep
 from elpd.record.sweep_file import SweepSearch
@@ -318,6 +320,32 @@ def test_events_alone_do_not_tell_the_lag_of_a_fast_sweep(folder: Any, monkeypat
     assert (code, found["outcome"]) == (1, "LOW_CONFIDENCE")
     assert abs(found["focus_us"] - focus_us) < found["sigma_us"]
     assert found["sigma_us"] > 2_000
+
+
+def test_a_profile_of_the_sensor_tells_the_lag_that_no_picture_does(
+    folder: Any, monkeypatch: Any, capsys: Any, tmp_path: Any
+) -> None:
+    path, focus_us = folder
+    options = (path / "events.npz", "--roi", "8,8,80,80", "--speed-um-s", str(SPEED_UM_S), "--json")
+    # an archive does not say how large its sensor was; 128 x 128 is the smallest known one that these events fit
+    profile = save(tmp_path, sensor_profile(128, 128, lag_us=30.0))
+    for state in (("--sensor", profile), ("--sensor", "stored", "--set", f"state.directory={tmp_path}")):
+        code, out, err = run(monkeypatch, capsys, *options, *state)
+        assert err == ""
+        found = json.loads(out)
+        assert (code, found["outcome"]) == (0, "FOCUSED")
+        assert abs(found["focus_us"] - focus_us) < 2 * found["sigma_us"] < 800
+
+
+def test_a_profile_of_another_sensor_is_refused(folder: Any, monkeypatch: Any, capsys: Any, tmp_path: Any) -> None:
+    path, _ = folder
+    other = save(tmp_path, sensor_profile(1280, 720, lag_us=30.0))
+    code, _, err = run(monkeypatch, capsys, path / "events.npz", "--sensor", other)
+    assert code == 2
+    assert "measured on 1280x720 pixels" in err
+    code, _, err = run(monkeypatch, capsys, path / "events.npz", "--sensor", tmp_path / "none.json")
+    assert code == 2
+    assert "cannot be read" in err
 
 
 @pytest.mark.parametrize(

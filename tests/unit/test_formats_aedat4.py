@@ -99,7 +99,7 @@ def test_a_live_cameras_small_packets_are_gathered(tmp_path: Path) -> None:
     assert read_all(tmp_path / "r.aedat4")[0] == [column.tolist() for column in columns]
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_no_damage_makes_the_reader_fail_in_another_way(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

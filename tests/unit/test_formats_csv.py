@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from elpd_drivers.formats.csv_text import FORMAT
-from event_files import GEOMETRY, event_columns, many, read_all, write_all
+from event_files import GEOMETRY, event_columns, many, peak_bytes, read_all, write_all
 from hypothesis import given
 from hypothesis import strategies as st
 from streams import cuts
@@ -111,6 +111,18 @@ def test_no_damage_makes_the_reader_fail_in_another_way(tmp_path_factory: pytest
     except FormatError:
         return
     assert events[0][:1] == [5]
+
+
+def test_memory_stays_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    columns = [column.tolist() for column in many(12_000)]
+
+    def there_and_back() -> None:
+        write_all(FORMAT.create(path, "csv", GEOMETRY, {}), columns, range(0, 12_000, 500))
+        with closing(open_recording(path)) as reader:
+            assert sum(len(one.data) for one in reader.packets(1 << 12)) == 12_000
+
+    assert peak_bytes(there_and_back) < 600_000
 
 
 def test_faery_reads_what_we_write(tmp_path: Path) -> None:

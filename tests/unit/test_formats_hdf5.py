@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from elpd_drivers.formats import hdf5
+from elpd_drivers.formats import hdf5, hdf5_child, hdf5_library
 from elpd_drivers.formats.hdf5 import FORMAT
 from event_files import GEOMETRY, edge, event_columns, many, packet, peak_bytes, read_all, write_all
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from streams import cuts
 
@@ -22,10 +22,43 @@ h5py = pytest.importorskip("h5py")
 
 EDGES = [edge(5010, 0), edge(5500, 1, rising=False), edge(99_000, 0)]
 EVENTS = [[5, 6, 90], [1, 2, 300], [4, 5, 6], [1, 0, 1]]
+
+
+class Here:
+    """The library without its own process, which takes a third of a second to start: for tests with many files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.content: Any = None
+
+    def ask(self, **question: Any) -> Any:
+        try:
+            self.content = self.content or hdf5_child.Content(str(self.path))
+            return self.content.answer(question)
+        except (OSError, RuntimeError, KeyError, ValueError, LookupError) as error:
+            raise FormatError(hdf5_library.told(self.path, str(error))) from error
+
+    def close(self) -> None:
+        if self.content is not None:
+            self.content.close()
+
+
+@pytest.fixture
+def child() -> Any:
+    """Ask for the library in its own process, as it is in use."""
+    return hdf5_library.Library
+
+
+@pytest.fixture(autouse=True)
+def _library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "child" not in request.fixturenames:
+        monkeypatch.setattr(hdf5, "Library", Here)
+
+
 words = st.sampled_from(sorted(FORMAT.writes))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(word=words, columns=event_columns(largest_step_us=30_000), cuts=cuts, chunk=st.integers(1, 2000))
 def test_what_is_written_is_read(
     tmp_path_factory: pytest.TempPathFactory, word: str, columns: Any, cuts: list[int], chunk: int
@@ -38,6 +71,7 @@ def test_what_is_written_is_read(
         assert reader.notes["header"] == {"serial_number": "7"}
 
 
+@pytest.mark.usefixtures("child")
 @pytest.mark.parametrize("word", FORMAT.writes)
 def test_long_files_and_edges_come_back(tmp_path: Path, word: str) -> None:
     path = tmp_path / "r.hdf5"
@@ -72,7 +106,7 @@ def naive_index(t: list[int]) -> list[tuple[int, int]]:
     return [*entries, current] if t else []
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(columns=event_columns(largest_step_us=9000), cuts=cuts)
 def test_the_index_is_as_their_software_makes_it(
     tmp_path_factory: pytest.TempPathFactory, columns: Any, cuts: list[int]
@@ -165,6 +199,7 @@ def test_a_filter_that_is_not_installed_is_named(tmp_path: Path) -> None:
         read_all(path)
 
 
+@pytest.mark.usefixtures("child")
 def test_without_h5py_the_message_says_how_to_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_all(FORMAT.create(tmp_path / "r.hdf5", "hdf5", GEOMETRY, {}), EVENTS[:0] or [[5], [1], [1], [1]])
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
@@ -185,6 +220,39 @@ def test_a_damaged_chunk_is_counted_and_the_rest_is_read(tmp_path: Path) -> None
         summary = summarise(reader)
     assert (summary["events"], summary["lost"]) == (40_000 - 16_384, 16_384)
     assert "events 16384 to 32767" in summary["lost_reason"][0]
+
+
+@pytest.mark.usefixtures("child")
+@pytest.mark.parametrize("size", [8, 100, 3000])
+def test_a_file_cut_short_is_told_through_the_pipe(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "r.hdf5"
+    write_all(FORMAT.create(path, "hdf5", GEOMETRY, {}), [column.tolist() for column in many(3000)])
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(FormatError, match="cannot be read as events: Unable to"):
+        open_recording(path)
+
+
+@pytest.mark.usefixtures("child")
+@pytest.mark.parametrize(
+    ("program", "message"),
+    [
+        ("import os, signal, sys; sys.stdin.readline(); os.kill(os.getpid(), signal.SIGSEGV)", "crashed on it"),
+        ("import sys; sys.stdin.readline(); sys.stdin.read()", "was still searching it after 0.2 s"),
+        ("import sys; sys.stdin.readline(); sys.stdout.buffer.write(bytes(3))", "crashed on it"),
+        ("import sys; sys.stdin.readline(); sys.stdout.buffer.write(bytes([255] * 8))", "one piece of it has"),
+    ],
+)
+def test_a_file_that_the_library_does_not_survive_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, message: str
+) -> None:
+    path = tmp_path / "r.hdf5"
+    write_all(FORMAT.create(path, "hdf5", GEOMETRY, {}), [[5], [1], [1], [1]])
+    (tmp_path / "child.py").write_text(program)
+    monkeypatch.setattr(hdf5_child, "__file__", str(tmp_path / "child.py"))
+    if "searching" in message:
+        monkeypatch.setattr(hdf5_library, "PATIENCE_S", 0.2)
+    with pytest.raises(FormatError, match=message):
+        open_recording(path)
 
 
 @pytest.mark.parametrize("word", FORMAT.writes)

@@ -100,7 +100,7 @@ def test_a_capped_lens_is_told(
     np.savez(path, t=noise.t_us, x=noise.x, y=noise.y, p=noise.on)
     code, text, _ = elpd(monkeypatch, capsys, path, "--size", "160,120", "--json")
     answer = json.loads(text)
-    assert code == 0
+    assert code == 1
     assert not answer["usable"]
     assert "lens capped" in answer["verdict"]
 

@@ -9,7 +9,7 @@ import pytest
 from command_line import caller
 
 from elpd.errors import ConfigError
-from elpd.web.token import read_or_make_token, token_path
+from elpd.web.token import read_or_make_token, read_token, token_path
 
 
 def test_it_is_made_once_and_only_its_owner_reads_it(tmp_path: Path) -> None:
@@ -78,10 +78,26 @@ def test_the_link_holds_the_token_in_its_fragment(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     elpd = caller(capsys, monkeypatch, tmp_path)
+    none = elpd("web", "--link", "--json", "--set", "web.token_file=here")
+    assert none.code == 2
+    assert "start `elpd web`" in none.json["error"]["message"]
+    token = read_or_make_token(tmp_path / "here")
     answer = elpd("web", "--link", "--json", "--set", "web.token_file=here", "--set", "web.port=4711").json
-    token = (tmp_path / "here").read_text().strip()
     assert answer == {"address": f"http://127.0.0.1:4711/#token={token}", "token_file": "here"}
     assert elpd("web", "--link", "--set", "web.token_file=here").out == f"http://127.0.0.1:8732/#token={token}\n"
+
+
+def test_the_link_of_the_service_is_for_root(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a file away")
+    service = tmp_path / "service.token"
+    token = read_or_make_token(service)
+    os.chown(service, 12345, 12345)
+    monkeypatch.setattr("elpd.web.token.SERVICE_TOKEN", service)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of-nobody"))
+    assert read_token(None) == (token, service)
+    with pytest.raises(ConfigError, match="no token yet"):
+        read_token(tmp_path / "configured")
 
 
 def test_an_open_port_without_allowed_hosts_is_refused(

@@ -17,16 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.errors import CameraError, ConfigError, UsageError
+from elpd.errors import CameraError, ConfigError
 from elpd.records import CameraPacket
 from elpd.units import NS_PER_MS, NS_PER_S, HostNs, SensorUs
+from elpd_drivers.cameras.abilities import ABILITIES
 from elpd_drivers.cameras.process import CaptureProcess
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from elpd.ports import Clock
-    from elpd.records import BiasSet, Frame, Geometry, Roi, Trigger
+    from elpd.records import Frame, Geometry, Trigger
     from elpd_drivers.cameras.ring import Taken
     from elpd_drivers.cameras.source import CaptureSettings, SourceFacts
 
@@ -70,19 +71,21 @@ def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSett
     except BaseException:
         process.close()
         raise
-    kind = type("CapturedCamera", tuple(ABILITIES[name] for name in facts.abilities) or (CapturedCamera,), {})
+    kind = type("CapturedCamera", (CapturedCamera, *(ABILITIES[name] for name in facts.abilities)), {})
     camera: CapturedCamera = kind(process, facts, lambda: _begin(backend, settings, common), common.max_delay_ms)
     return camera
 
 
 def _begin(backend: str, settings: Mapping[str, Any], common: CaptureSettings) -> CaptureProcess:
-    return CaptureProcess(backend, settings, ring_mb=common.ring_mb, open_timeout_s=common.open_timeout_s)
+    return CaptureProcess(
+        backend, settings, ring_mb=common.ring_mb, open_timeout_s=common.open_timeout_s, hang_ms=common.hang_ms
+    )
 
 
 class CapturedCamera:
     """An ``EventCamera`` with ``Latency``, ``Identified``, ``Counters``, ``Reopens`` and ``Closeable``.
 
-    What only some cameras can do is mixed in by ``open_captured``, from ``ABILITIES``.
+    What only some cameras can do is mixed in by ``open_captured``, from ``abilities.ABILITIES``.
     """
 
     def __init__(self, process: CaptureProcess, facts: SourceFacts, begin: Any, max_delay_ms: float) -> None:
@@ -303,54 +306,3 @@ class CapturedCamera:
         if self._process is not None:
             self._notes = self._process.notes()
             self._process, self._ending = None, self._process
-
-
-class _Window(CapturedCamera):
-    def set_window(self, window: Roi | None) -> None:
-        """Deliver only *window*, or everything again with ``None``. Raises ``UsageError`` if it does not fit."""
-        if window is not None and not window.fits(self.geometry):
-            raise UsageError(
-                f"camera: window {window.x},{window.y},{window.width},{window.height} does not fit the sensor of "
-                f"{self.geometry.width}x{self.geometry.height}; choose one inside it"
-            )
-        self.call("set_window", None if window is None else [window.x, window.y, window.width, window.height])
-
-
-class _Biases(CapturedCamera):
-    def apply_biases(self, biases: BiasSet) -> None:
-        """Switch to a set of biases; a few milliseconds of disorder follow."""
-        self.call("apply_biases", biases.value)
-
-
-class _Mask(CapturedCamera):
-    def set_mask(self, pixels: Sequence[tuple[int, int]]) -> int:
-        """Switch off the first of *pixels*, as many as there are slots; return how many."""
-        return int(self.call("set_mask", [[int(x), int(y)] for x, y in pixels]))
-
-
-class _TriggerInput(CapturedCamera):
-    def enable_trigger(self, *, on: bool) -> None:
-        """Listen to the trigger input, or do not."""
-        self.call("enable_trigger", on)
-
-
-class _RateLimit(CapturedCamera):
-    def limit_rate(self, mev_s: float | None) -> None:
-        """Let the sensor send that many million events a second at most, or all with ``None``."""
-        self.call("limit_rate", mev_s)
-
-
-class _Temperature(CapturedCamera):
-    def temperature_c(self) -> float:
-        """Return the sensor's temperature."""
-        return float(self.call("temperature_c"))
-
-
-ABILITIES: dict[str, type[CapturedCamera]] = {
-    "window": _Window,
-    "biases": _Biases,
-    "mask": _Mask,
-    "trigger": _TriggerInput,
-    "rate_limit": _RateLimit,
-    "temperature": _Temperature,
-}

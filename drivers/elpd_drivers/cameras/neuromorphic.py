@@ -12,18 +12,24 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
-from elpd.errors import CameraError, ConfigError, UsageError
+from elpd.errors import CameraError, UsageError
 from elpd.records import BiasSet, Encoding, Frame, Geometry, Trigger
 from elpd.units import SensorUs
 from elpd_drivers.cameras.capture import CapturedCamera, open_captured
+from elpd_drivers.cameras.neuromorphic_tables import (
+    BUFFERS_IN_FLIGHT,
+    NeuromorphicSettings,
+    check_bounds,
+    choose,
+    configured,
+)
 from elpd_drivers.cameras.refusals import explain
 from elpd_drivers.cameras.ring import Captured
-from elpd_drivers.cameras.source import CaptureSettings, SourceFacts, layout_of, need, read_table
+from elpd_drivers.cameras.source import SourceFacts, layout_of, need, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,47 +39,9 @@ if TYPE_CHECKING:
 
 INSTALL = "pip install 'elpd[neuromorphic]'"
 EVENTS = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
-BUFFERS_IN_FLIGHT = 32
-RATE_PERIOD_US = 200
-"""The rate controller counts in periods; the one that the maker's examples use."""
-
 MASK_SLOTS = {"prophesee_evk4": 64, "inivation_davis346": 8}
 USB3_LATENCY_US = 150.0
 """Assumed until measured: a micro-frame of 125 us and its interrupt. ``camera.min_latency_us`` replaces it."""
-
-MODELS = {
-    "evk4": "prophesee_evk4",
-    "evk3-hd": "prophesee_evk3_hd",
-    "centuryarks-vga": "centuryarks_vga",
-    "davis346": "inivation_davis346",
-    "dvxplorer": "inivation_dvxplorer",
-}
-
-
-class BiasTables(BaseModel):
-    """The two settings of the sensor's biases, by the library's names; others stay as the factory set them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    expose: dict[str, int] = {}
-    focus: dict[str, int] = {}
-
-
-class NeuromorphicSettings(CaptureSettings):
-    """The table ``[camera]`` for the driver ``neuromorphic``.
-
-    ``model`` is ``auto`` (what is plugged in) or one of ``MODELS``. ``rate_limit_mev_s`` bounds what a Prophesee sensor
-    sends, ``trigger`` listens to an EVK4's trigger input: the library sets both when it opens and not later.
-    ``usb_packets`` is how many buffers of 128 KiB it keeps. ``exposure_us`` and ``frame_interval_us`` are a DAVIS346's.
-    """
-
-    model: Literal["auto", "evk4", "evk3-hd", "centuryarks-vga", "davis346", "dvxplorer"] = "auto"
-    biases: BiasTables = BiasTables()
-    rate_limit_mev_s: Annotated[float, Field(gt=0, le=1000)] | None = None
-    trigger: bool = True
-    usb_packets: Annotated[int, Field(gt=BUFFERS_IN_FLIGHT, le=4096)] = 256
-    exposure_us: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
-    frame_interval_us: Annotated[int, Field(ge=1, le=10_000_000)] = 40_000
 
 
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> CapturedCamera:
@@ -92,9 +60,9 @@ def open_source(settings: dict[str, Any]) -> NeuromorphicSource:
 
     table = NeuromorphicSettings.model_validate(settings)
     try:
-        kind, serial = _choose(nd, table)
+        kind, serial = choose(nd, table)
         module = getattr(nd, kind)
-        configuration = _configured(module, table)
+        configuration = configured(module, table)
         device = nd.open(
             configuration,
             iterator_timeout=0.005,
@@ -107,7 +75,7 @@ def open_source(settings: dict[str, Any]) -> NeuromorphicSource:
         )
     except RuntimeError as error:
         raise CameraError(explain(str(error), "neuromorphic-drivers")) from None
-    _check_bounds(table.biases, device.biases_bounds(), kind)
+    check_bounds(table.biases, device.biases_bounds(), kind)
     return NeuromorphicSource(device, module, kind, configuration, table)
 
 
@@ -254,66 +222,6 @@ class NeuromorphicSource:
         for slot, (x, y) in enumerate(chosen):
             mask.set(slot, x, geometry.height - 1 - y)
         return {"pixel_mask": mask.pixel_mask()}
-
-
-def _choose(nd: Any, table: NeuromorphicSettings) -> tuple[str, str]:
-    """Find the camera that is meant. Raises ``CameraError`` with what is there instead."""
-    wanted = MODELS.get(table.model)
-    listed = nd.list_devices()
-    there = [(device.name.name.lower(), device.serial) for device in listed if device.error is None]
-    fitting = [
-        (kind, serial)
-        for kind, serial in there
-        if serial is not None and wanted in {None, kind} and table.serial in {None, serial}
-    ]
-    if len(fitting) == 1:
-        return fitting[0]
-    found = ", ".join(f"{kind.replace('_', ' ')} {serial}" for kind, serial in there)
-    if fitting:
-        raise CameraError(f"camera: several would do ({found}); choose one with camera.serial")
-    errors = [device.error for device in listed if device.error is not None]
-    if errors and not there:
-        raise CameraError(explain(errors[0], "neuromorphic-drivers"))
-    asked = " ".join(filter(None, (table.model if wanted else "", table.serial or ""))) or "any"
-    raise CameraError(
-        f"camera: none found (asked for: {asked}; plugged in: {found or 'none that neuromorphic-drivers knows'}); "
-        "check the cable and camera.model; `elpd check` lists what is plugged in"
-    )
-
-
-def _configured(module: Any, table: NeuromorphicSettings) -> Any:
-    """Build the library's configuration; the sensor begins with the biases for focusing."""
-    known = {field.name for field in fields(module.Configuration)}
-    for where, biases in (("expose", table.biases.expose), ("focus", table.biases.focus)):
-        names = {field.name for field in fields(module.Biases)}
-        for name in biases:
-            if name not in names:
-                raise ConfigError(
-                    f"camera.biases.{where}.{name}: this camera has no such bias; it has {', '.join(sorted(names))}"
-                )
-    wanted: dict[str, Any] = {"biases": module.Biases(**table.biases.focus)}
-    if "enable_external_trigger" in known:
-        wanted["enable_external_trigger"] = table.trigger
-    if "exposure_us" in known:
-        wanted |= {"exposure_us": table.exposure_us, "frame_interval_us": table.frame_interval_us}
-    if table.rate_limit_mev_s is not None:
-        if "rate_limiter" not in known:
-            raise ConfigError("camera.rate_limit_mev_s: this camera has no rate controller; remove the key")
-        most = max(1, round(table.rate_limit_mev_s * RATE_PERIOD_US))
-        wanted["rate_limiter"] = module.RateLimiter(reference_period_us=RATE_PERIOD_US, maximum_events_per_period=most)
-    return module.Configuration(**wanted)
-
-
-def _check_bounds(biases: BiasTables, bounds: Any, kind: str) -> None:
-    """Refuse biases that this very sensor cannot be set to. Raises ``ConfigError``."""
-    for where, table in (("expose", biases.expose), ("focus", biases.focus)):
-        for name, value in table.items():
-            allowed = getattr(bounds, name, None)
-            if allowed is not None and not allowed.minimum <= value <= allowed.maximum:
-                raise ConfigError(
-                    f"camera.biases.{where}.{name}: {value} is outside what this {kind.replace('_', ' ')} takes, "
-                    f"{allowed.minimum} to {allowed.maximum}"
-                )
 
 
 def _abilities(kind: str, configuration: Any) -> list[str]:

@@ -30,18 +30,14 @@ if TYPE_CHECKING:
 CHILD = "elpd_drivers.cameras.capture_child"
 SLOTS = 4096
 MESSAGE_BYTES = 1 << 17
-HANG_MS = 50.0
-"""A child that has not turned its loop for so long (it does every 5 ms at the latest) hangs; a lens at 4 mm/s goes
-200 um in this time."""
-
 SECOND_LOOK_MS = 5
 """A machine that stood still stops both processes: the child gets this long to show itself before it counts as hung."""
 
 STARVED_MS = 1000.0
 """A child that would run if it were let is not hung but starved, by a machine that is too busy: it gets this long."""
 
-CALL_S = 1.0
-"""Bias and window changes are a few register writes over USB, some milliseconds each."""
+CALL_S = 3.0
+"""Bias and window changes are a few register writes over USB, some milliseconds each; a busy machine adds to that."""
 
 END_S = 3.0
 """A camera that is given back stops its sensor first; an EVK4 sleeps through a second of that."""
@@ -64,10 +60,14 @@ class CaptureProcess:
         Memory for packets that wait.
     open_timeout_s
         How long opening may take.
+    hang_ms
+        A child that has not turned its loop for so long, and does not wait for a processor either, hangs.
     """
 
-    def __init__(self, backend: str, settings: Mapping[str, Any], *, ring_mb: float, open_timeout_s: float) -> None:
-        self._open_timeout_s = open_timeout_s
+    def __init__(
+        self, backend: str, settings: Mapping[str, Any], *, ring_mb: float, open_timeout_s: float, hang_ms: float
+    ) -> None:
+        self._open_timeout_s, self._hang_ms = open_timeout_s, hang_ms
         self._memory, memory = RingMemory.make(SLOTS, round(ring_mb * (1 << 20)))
         self._semaphore = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -123,7 +123,7 @@ class CaptureProcess:
                 self._listen()
 
     def check(self) -> None:
-        """Raise ``CameraError`` if the child has not turned its loop for ``HANG_MS``, or takes too long to open."""
+        """Raise ``CameraError`` if the child hangs, or takes too long to open."""
         if self.facts is None:
             opening_s = time.monotonic() - self._opened
             if opening_s > self._open_timeout_s:
@@ -132,9 +132,10 @@ class CaptureProcess:
                     "in again, or raise camera.open_timeout_s"
                 )
             return
-        if self._silent_ms() > HANG_MS:
+        if self._silent_ms() > self._hang_ms:
             self.wait(SECOND_LOOK_MS)
-            silent_ms, limit_ms = self._silent_ms(), STARVED_MS if self._would_run() else HANG_MS
+            limit_ms = max(self._hang_ms, STARVED_MS) if self._would_run() else self._hang_ms
+            silent_ms = self._silent_ms()
             if silent_ms > limit_ms:
                 self._lose(
                     f"camera: its library hangs, nothing for {silent_ms:.0f} ms (limit {limit_ms:.0f}); "
@@ -243,12 +244,16 @@ class CaptureProcess:
         return (time.monotonic_ns() - self.reader.heartbeat_ns) / 1e6
 
     def _would_run(self) -> bool:
-        """Say whether the child runs, waits for a processor or for its memory, rather than in a library's call."""
-        try:
-            stat = Path(f"/proc/{self.pid}/stat").read_text(encoding="ascii", errors="replace")
-        except OSError:
-            return False
-        return stat.rpartition(")")[2].split()[0] in {"R", "D"}
+        """Say whether any of the child's threads runs, or waits for a processor or for its memory.
+
+        A library's call may wait for a thread of the library's own, which is only starved.
+        """
+        with suppress(OSError):
+            for thread in Path(f"/proc/{self.pid}/task").iterdir():
+                stat = (thread / "stat").read_text(encoding="ascii", errors="replace")
+                if stat.rpartition(")")[2].split()[0] in {"R", "D"}:
+                    return True
+        return False
 
     def _listen(self) -> None:
         """Keep the end of what the library prints."""

@@ -34,7 +34,7 @@ class SourceFacts:
     """What is constant about an open camera.
 
     ``layout`` describes the event array's dtype (``numpy.dtype``'s dictionary of names, formats, offsets, itemsize) and
-    is ``None`` for words. ``abilities`` are keys of ``capture.ABILITIES``. ``min_latency_us`` is the shortest delay
+    is ``None`` for words. ``abilities`` are keys of ``abilities.ABILITIES``. ``min_latency_us`` is the shortest delay
     from an event to ``Captured.received_ns``.
     """
 
@@ -109,8 +109,9 @@ class CaptureSettings(BaseModel):
 
     ``serial`` chooses among several. ``ring_mb`` is the memory in which packets wait for the controller, and
     ``max_delay_ms`` how late a packet may be before everything but the newest is thrown away and counted; 0 is never.
-    ``open_timeout_s`` bounds opening, for which an EVK4 takes 4.5 s. ``min_latency_us`` is the shortest time from pixel
-    to host, where it was measured.
+    ``open_timeout_s`` bounds opening, for which an EVK4 takes 4.5 s. A library that gives no sign of life for
+    ``hang_ms`` (it should every 5) is ended; a lens at 4 mm/s goes 200 um in the 50 of the default. ``min_latency_us``
+    is the shortest time from pixel to host, where it was measured.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -119,6 +120,7 @@ class CaptureSettings(BaseModel):
     ring_mb: Annotated[float, Field(ge=1, le=4096)] = 64.0
     max_delay_ms: NonNegative = 250.0
     open_timeout_s: Positive = 20.0
+    hang_ms: Annotated[float, Field(ge=20)] = 50.0
     min_latency_us: NonNegative | None = None
 
 

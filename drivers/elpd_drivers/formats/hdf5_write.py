@@ -120,6 +120,8 @@ class _Table:
         self._latest_us = 0
         self._entries = 0
         self._before = (0, -1)
+        self._due: list[NDArray[Any]] = []
+        self._due_count = 0
 
     def append(self, events: NDArray[Any]) -> None:
         """Append rows with a field ``t``."""
@@ -139,6 +141,7 @@ class _Table:
         self._write_held()
         if self._origin_us is not None:
             self._add_entries(np.array([self._before], ENTRY))
+            self._write_entries()
 
     def _write_held(self) -> None:
         if self._held_count == 0:
@@ -174,6 +177,13 @@ class _Table:
         self._seen += t.size
 
     def _add_entries(self, entries: NDArray[Any]) -> None:
-        self._index.resize((self._entries + entries.size,))
-        self._index[self._entries :] = entries
+        self._due.append(entries)
+        self._due_count += entries.size
         self._entries += entries.size
+        if self._due_count >= CHUNK:
+            self._write_entries()
+
+    def _write_entries(self) -> None:
+        self._index.resize((self._entries,))
+        self._index[self._entries - self._due_count :] = np.concatenate(self._due)
+        self._due, self._due_count = [], 0

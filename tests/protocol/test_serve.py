@@ -1,0 +1,248 @@
+"""The daemon as a process: what it says when it is ready, how it takes signals, how it ends. Nothing here is timed."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from elpd.cli.sim_board import find_board
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+ELPD = (sys.executable, "-c", "from elpd.cli import main; main()")
+PATIENCE_S = 120.0
+"""A machine that runs a test on every core compiles kernels slowly."""
+
+
+@dataclass
+class Served:
+    """A daemon and a connection to it."""
+
+    process: subprocess.Popen[str]
+    folder: Path
+    heard: queue.Queue[str]
+    hello: dict[str, Any]
+
+    def connect(self) -> Connection:
+        """Open another connection."""
+        return Connection(self.hello["socket"])
+
+    def heard_until(self, word: str) -> str:
+        """Return the next datagram for the supervisor that begins with a word."""
+        while not (told := self.heard.get(timeout=PATIENCE_S)).startswith(word):
+            pass
+        return told
+
+    def end(self) -> int:
+        """Ask it to end, and see how it does."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(PATIENCE_S)
+
+
+class Connection:
+    """One JSON object a line, each way."""
+
+    def __init__(self, path: str) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(PATIENCE_S)
+        self._socket.connect(path)
+        self._lines = self._socket.makefile("rwb")
+
+    def send(self, method: str, **params: Any) -> None:
+        self._lines.write(json.dumps({"id": 1, "method": method, "params": params}).encode() + b"\n")
+        self._lines.flush()
+
+    def receive(self) -> dict[str, Any]:
+        answer: dict[str, Any] = json.loads(self._lines.readline())
+        return answer
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        self.send(method, **params)
+        return self.receive()
+
+    def until(self, event: str, **fields: Any) -> dict[str, Any]:
+        while True:
+            told = self.receive()
+            if told.get("event") == event and all(told.get(key) == value for key, value in fields.items()):
+                return told
+
+    def close(self) -> None:
+        self._lines.close()
+        self._socket.close()
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    begun: list[Served] = []
+    supervisors: list[socket.socket] = []
+
+    def begin(*overrides: str) -> Served:
+        supervisor = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        supervisor.bind(str(tmp_path / f"notify-{len(begun)}"))
+        supervisors.append(supervisor)
+        (tmp_path / "elpd.toml").write_text(
+            f'[api]\nsocket = "{tmp_path}/elpd.sock"\n[journal]\ndirectory = "{tmp_path}/runs"\n'
+            f'[state]\ndirectory = "{tmp_path}/state"\n[sim]\nwidth = 320\nheight = 240\nscene = "camera"\nseed = 3\n'
+        )
+        settings = [word for override in overrides for word in ("--set", override)]
+        process = subprocess.Popen(
+            [*ELPD, "serve", "--json", "--config", str(tmp_path / "elpd.toml"), *settings],
+            env={**os.environ, "NOTIFY_SOCKET": supervisor.getsockname(), "WATCHDOG_USEC": "2000000"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, process.communicate()[1]
+        heard: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=_read_all, args=(supervisor, heard), daemon=True).start()
+        served = Served(process, tmp_path, heard, json.loads(line))
+        begun.append(served)
+        return served
+
+    yield begin
+    for served in begun:
+        if served.process.poll() is None:
+            served.process.kill()
+        served.process.communicate()
+    for supervisor in supervisors:
+        supervisor.sendto(b"", supervisor.getsockname())
+
+
+def test_a_daemon_serves_tells_its_supervisor_and_ends_in_order(serve: Callable[..., Served]) -> None:
+    daemon = serve()
+    assert daemon.hello["pid"] == daemon.process.pid
+    assert daemon.hello["state"] == "READY"
+    assert daemon.heard_until("READY=1").endswith("STATUS=READY, one-shot")
+    daemon.heard_until("WATCHDOG=1")
+    connection = daemon.connect()
+    result = connection.call("focus")["result"]
+    assert result["outcome"] == "FOCUSED"
+    assert (daemon.folder / "runs" / result["run"] / "run.json").exists()
+    ticks = connection.call("status")["result"]["ticks"]
+    assert set(ticks) == {"focus", "api"}
+    connection.close()
+    assert daemon.end() == 0
+    daemon.heard_until("STOPPING=1")
+    assert json.loads((daemon.folder / "state" / "service.json").read_text())["content"]["open"] is False
+
+
+def test_sigterm_in_a_cycle_ends_it_where_the_lens_stops(serve: Callable[..., Served]) -> None:
+    daemon = serve("sim.pace=0.05")
+    watcher, asker = daemon.connect(), daemon.connect()
+    watcher.call("subscribe", events=["phase"])
+    asker.send("focus")
+    watcher.until("phase", phase="sweep")
+    assert daemon.end() == 0
+    result = asker.receive()["result"]
+    assert result["outcome"] == "CANCELLED"
+    assert "going down" in result["reason"]
+
+
+def test_a_stop_comes_through_while_a_cycle_runs(serve: Callable[..., Served]) -> None:
+    daemon = serve("sim.pace=0.05")
+    watcher, asker = daemon.connect(), daemon.connect()
+    watcher.call("subscribe", events=["phase"])
+    asker.send("focus")
+    watcher.until("phase", phase="sweep")
+    stop = daemon.connect().call("stop")["result"]
+    assert stop["stopped"] is True
+    assert asker.receive()["result"]["outcome"] == "CANCELLED"
+    assert daemon.connect().call("status")["result"]["state"] == "READY"
+
+
+def test_a_killed_daemon_comes_back_unreferenced(serve: Callable[..., Served]) -> None:
+    first = serve()
+    first.process.kill()
+    first.process.wait(PATIENCE_S)
+    again = serve()
+    connection = again.connect()
+    assert connection.call("status")["result"]["lens"]["referenced"] is False
+    assert connection.call("move", fraction=0.5)["error"]["kind"] == "Unreferenced"
+    assert "result" in connection.call("home")
+
+
+def test_sighup_takes_a_good_configuration_and_refuses_a_bad_one(serve: Callable[..., Served]) -> None:
+    daemon = serve()
+    daemon.heard_until("READY=1")
+    path = daemon.folder / "elpd.toml"
+    good = path.read_text()
+    path.write_text(good + "[focus]\ndeadlin_ms = 3\n")
+    daemon.process.send_signal(signal.SIGHUP)
+    daemon.heard_until("RELOADING=1")
+    daemon.heard_until("READY=1")
+    connection = daemon.connect()
+    warnings = connection.call("status")["result"]["warnings"]
+    assert [one["code"] for one in warnings] == ["config-refused"]
+    assert "elpd.toml:13" in warnings[0]["text"]
+    path.write_text(good + "[focus]\ndeadline_ms = 1\n")
+    daemon.process.send_signal(signal.SIGHUP)
+    daemon.heard_until("RELOADING=1")
+    daemon.heard_until("READY=1")
+    assert connection.call("status")["result"]["warnings"] == []
+    assert connection.call("focus")["result"]["outcome"] == "DEADLINE"
+
+
+def test_a_second_daemon_on_the_socket_is_refused(serve: Callable[..., Served]) -> None:
+    daemon = serve()
+    second = subprocess.run(
+        [*ELPD, "serve", "--json", "--config", str(daemon.folder / "elpd.toml")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+    assert second.returncode == 4
+    assert json.loads(second.stdout)["error"]["kind"] == "BusyError"
+    assert daemon.connect().call("status")["result"]["state"] == "READY"
+
+
+def test_a_wrong_configuration_is_no_reason_to_try_again(tmp_path: Path) -> None:
+    (tmp_path / "bad.toml").write_text("[service]\npol_ms = 3\n")
+    ended = subprocess.run(
+        [*ELPD, "serve", "--config", str(tmp_path / "bad.toml")], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 2
+    assert "bad.toml:2: service.pol_ms: unknown key" in ended.stderr
+
+
+def test_parking_stops_a_lens_that_nobody_drives_any_more() -> None:
+    board = find_board("tic").serve({"seed": 1, "um_per_step": 0.3125, "referenced": True})
+    try:
+        rig = ("--set", "lens.driver=tic", "--set", f"lens.port={board.port}", "--set", "lens.reply_ms=2000.0")
+        parked = _elpd("park", "--emergency", "--json", *rig)
+        assert parked.returncode == 0, parked.stderr
+        assert json.loads(parked.stdout)["stopped"] is True
+        assert _elpd("park", *rig).returncode == 2, "it must be meant"
+    finally:
+        board.close()
+    assert _elpd("park", "--emergency", *rig).returncode == 3, "the port is gone"
+    told = _elpd("park", "--emergency", "--json")
+    assert json.loads(told.stdout) == {
+        "stopped": False,
+        "reason": "a simulated lens ends with its daemon: there is nothing to stop",
+    }
+
+
+def _read_all(supervisor: socket.socket, heard: queue.Queue[str]) -> None:
+    """Read as systemd does: at once, so that nothing is lost."""
+    with supervisor:
+        while told := supervisor.recv(4096):
+            heard.put(told.decode())
+
+
+def _elpd(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*ELPD, *arguments], capture_output=True, text=True, check=False, timeout=PATIENCE_S)

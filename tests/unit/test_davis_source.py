@@ -1,0 +1,181 @@
+"""dv-processing behind our door: its own stores, frames and triggers, handed out by a camera that is not there."""
+
+from __future__ import annotations
+
+from collections import deque
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from elpd_drivers.cameras import davis
+from elpd_drivers.cameras.davis import DavisSettings, DavisSource
+from virtual import MonotonicClock
+
+from elpd.errors import CameraError, ConfigError
+from elpd.events.layout import event_columns
+from elpd.records import Encoding, Geometry
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+dv = pytest.importorskip("dv_processing")
+
+EPOCH_US = 1_795_388_665_467_217
+
+
+class Camera:
+    """Whatever is set is noted; whatever is asked for next is what the test put there."""
+
+    def __init__(self) -> None:
+        self.said: dict[str, Any] = {}
+        self.batches: dict[str, deque[Any]] = {name: deque() for name in ("Event", "Frame", "Imu", "Trigger")}
+        self.running = True
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("set"):
+            return lambda *values: self.said.update({name.removeprefix("set"): values})
+        kind = name.removeprefix("getNext").removesuffix("Batch")
+        if kind in self.batches:
+            return lambda: self.batches[kind].popleft() if self.batches[kind] else None
+        answers = {
+            "isRunning": lambda: self.running,
+            "getEventResolution": lambda: (346, 260),
+            "getCameraName": lambda: "DAVIS346_00000499",
+            "getSerialNumber": lambda: "00000499",
+            "getDavis346BiasCoarseFine": lambda _: (4, 39),
+        }
+        if name not in answers:
+            raise AttributeError(name)
+        return answers[name]
+
+
+def source(**settings: Any) -> tuple[DavisSource, Camera]:
+    camera = Camera()
+    return DavisSource(camera, dv, DavisSettings.model_validate(settings)), camera
+
+
+def store(events: Sequence[tuple[int, int, int, bool]]) -> Any:
+    made = dv.EventStore()
+    for event in events:
+        made.push_back(*event)
+    return made
+
+
+def test_the_store_that_the_library_makes_is_the_one_we_know() -> None:
+    assert store([(1, 2, 3, True)]).numpy().dtype == davis.EVENTS
+
+
+def test_events_are_copied_and_counted_from_a_second_before_the_first() -> None:
+    opened, camera = source()
+    given = store([(EPOCH_US, 3, 4, True), (EPOCH_US + 700, 5, 6, False)])
+    camera.batches["Event"].append(given)
+    packet = opened.read(0.0)
+    assert packet is not None
+    assert isinstance(packet.data, np.ndarray)
+    assert not np.shares_memory(packet.data, given.numpy())
+    t, x, y, p = event_columns(packet.data)
+    assert [column.tolist() for column in (x, y, p)] == [[3, 5], [4, 6], [1, 0]]
+    assert np.diff(t).tolist() == [700]
+    assert packet.events == 2
+    assert packet.complete_until_us == int(t[-1]) - 1000, "a commit interval behind the newest stamp"
+
+
+def test_the_inertial_sensor_keeps_time_in_the_dark() -> None:
+    opened, camera = source()
+    camera.batches["Imu"] += [[dv.IMU(EPOCH_US + at, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)] for at in (0, 1000)]
+    first, second = opened.read(0.0), opened.read(0.0)
+    assert first is not None
+    assert second is not None
+    assert (first.events, len(first.data)) == (0, 0)
+    assert second.complete_until_us == (first.complete_until_us or 0) + 1000
+    assert opened.read(0.0) is None
+
+
+def test_a_frame_is_dated_by_the_middle_of_its_exposure_and_known_after_its_read_out() -> None:
+    opened, camera = source()
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    camera.batches["Imu"].append([dv.IMU(EPOCH_US, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)])
+    camera.batches["Frame"].append(dv.Frame(EPOCH_US + 10_000, 500, 0, 0, image, dv.FrameSource.SENSOR))
+    packet = opened.read(0.0)
+    assert packet is not None
+    (frame,) = packet.frames
+    assert (frame.t_us, frame.exposure_us) == (1_010_250, 500)
+    assert frame.available_us == 1_010_500 + davis.READ_OUT_US
+    np.testing.assert_array_equal(frame.pixels, image)
+
+
+def test_edges_of_the_signal_input_are_triggers_and_the_exposure_s_are_not() -> None:
+    opened, camera = source()
+    kinds = dv.TriggerType
+    camera.batches["Imu"].append([dv.IMU(EPOCH_US, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)])
+    camera.batches["Trigger"].append([
+        dv.Trigger(EPOCH_US + at, kind)
+        for at, kind in enumerate(
+            (kinds.APS_EXPOSURE_START, kinds.EXTERNAL_SIGNAL_RISING_EDGE, kinds.EXTERNAL_SIGNAL_FALLING_EDGE)
+        )
+    ])  # fmt: skip
+    packet = opened.read(0.0)
+    assert packet is not None
+    assert opened.notes() == {"frames": 0}
+    assert [(edge.t_us, edge.rising) for edge in packet.triggers] == [(1_000_001, True), (1_000_002, False)]
+
+
+def test_the_settings_reach_the_camera() -> None:
+    opened, camera = source(
+        exposure_us=700, frame_interval_us=20_000, interval_us=2000, trigger=False, biases={"focus": {"On": (5, 100)}}
+    )
+    said = camera.said
+    assert said["TimeInterval"] == said["USBEarlyPacketDelay"] == (timedelta(milliseconds=2),)
+    assert (said["AutoExposure"], said["ExposureDuration"]) == ((False,), (timedelta(microseconds=700),))
+    assert said["FrameInterval"] == (timedelta(milliseconds=20),)
+    assert said["DetectorRunning"] == (False,)
+    biases = dv.io.camera.DAVIS.Davis346BiasCF
+    assert said["Davis346BiasCoarseFine"] == (biases.On, 5, 100)
+    opened.call("apply_biases", ["expose"])
+    assert said["Davis346BiasCoarseFine"] == (biases.On, 4, 39), "what only the other set names goes back"
+    opened.call("set_window", [[10, 20, 30, 40]])
+    assert said["CropAreaEvents"] == ((10, 20, 30, 40),)
+    opened.call("set_window", [None])
+    assert said["CropAreaEvents"] == ((0, 0, 346, 260),)
+    opened.call("enable_trigger", [True])
+    assert said["DetectorRunning"] == (True,)
+    assert opened.facts.geometry == Geometry(346, 260)
+    assert (opened.facts.encoding, opened.facts.serial) == (Encoding.ARRAY, "00000499")
+    assert opened.facts.min_latency_us == 2000
+
+
+def test_every_method_that_is_called_is_the_library_s_own() -> None:
+    """The camera above agrees to anything; the real class must know each name."""
+    opened, camera = source(exposure_us=700)
+    opened.call("set_window", [None])
+    for name in camera.said:
+        assert hasattr(dv.io.camera.DAVIS, f"set{name}"), name
+    for name in ("isRunning", "getEventResolution", "getCameraName", "getSerialNumber", "getNextImuBatch"):
+        assert hasattr(dv.io.camera.DAVIS, name), name
+
+
+def test_an_unplugged_camera_is_an_error() -> None:
+    opened, camera = source()
+    camera.running = False
+    with pytest.raises(CameraError, match=r"unplugged \(no device\)"):
+        opened.read(0.0)
+    opened.close()
+    opened.close()
+
+
+def test_wrong_tables_say_so() -> None:
+    with pytest.raises(ConfigError, match=r"camera\.biases\.focus\.on: a DAVIS346 has no such bias; it has .*Diff.*On"):
+        source(biases={"focus": {"on": (1, 2)}})
+    for table, reason in (
+        ({"exposure": 3}, r"camera\.exposure: unknown key; known are .*exposure_us"),
+        ({"biases": {"focusing": {}}}, r"camera\.biases\.focusing: unknown key; known are expose, focus"),
+        ({"interval_us": 10}, r"camera\.interval_us: .*greater than or equal to 1000 \(got 10\)"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            davis.open_camera(table, MonotonicClock())
+
+
+def test_no_camera_is_a_sentence() -> None:
+    with pytest.raises(CameraError, match=r"no iniVation camera found|dv-processing"):
+        davis.open_source({})
