@@ -151,7 +151,7 @@ class FakeEngine:
         for ticket in self.waiting:
             ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
 
-    def heard(self, what: Callable[[], bool], limit_s: float = 10.0) -> None:
+    def heard(self, what: Callable[[], bool], limit_s: float = 30.0) -> None:
         """Wait until the engine has heard what the test waits for."""
         with self._changed:
             assert self._changed.wait_for(what, limit_s), f"not heard within {limit_s:g} s"

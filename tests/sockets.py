@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-LIMIT_S = 10.0
+LIMIT_S = 30.0
 
 
 @contextmanager

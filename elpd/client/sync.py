@@ -113,15 +113,19 @@ class Client(Methods):
         params = given(roi=roi, reference=reference, preset=preset, dry_run=dry_run, on_disconnect=on_disconnect)
         if on_event is not None:
             self.begin("subscribe", {}, on_event).result(self.timeout_s)
-        pending = self.begin("focus", params)
+        pending: Pending | None = None
         try:
+            pending = self.begin("focus", params)
             answer: FocusAnswer = pending.result(timeout_s)
         except TimeUpError:
+            assert pending is not None
             self.cancel()
             answer = pending.result(CANCEL_S)
         except KeyboardInterrupt:
-            pending.cancel()
-            pending.result(CANCEL_S)
+            if self._link is not None:  # also where it came while the request was on its way out
+                self._link.post("cancel")
+            if pending is not None:
+                pending.result(CANCEL_S)
             raise
         finally:
             if on_event is not None and self._alive():
