@@ -30,7 +30,8 @@ from elpd_drivers.sim.rig import SimSettings
 from elpd import rig
 from elpd.config import Config, load
 from elpd.errors import ElpdError
-from elpd.focus.cycle import FocusCycle, result_fields
+from elpd.focus.cycle import FocusCycle
+from elpd.focus.fields import result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
 
 ERRORS = ("estimate_error_um", "stop_error_um", "final_error_um")

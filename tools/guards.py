@@ -22,7 +22,8 @@ from typing import Any
 from elpd import rig
 from elpd.config import load
 from elpd.errors import ElpdError
-from elpd.focus.cycle import FocusCycle, result_fields
+from elpd.focus.cycle import FocusCycle
+from elpd.focus.fields import result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.records import Roi
 

@@ -43,7 +43,8 @@ def command(*, run: Path, config_path: Path | None, overrides: tuple[str, ...], 
 def run_cycle(parts: RigParts, run: RecordedRun, sink: RunSink, cancelled: Callable[[], int]) -> Mapping[str, Any]:
     """Build the cycle that *run* recorded from what is in its folder, and run it on *parts*."""
     from elpd.config import Config  # noqa: PLC0415
-    from elpd.focus.cycle import FocusCycle, result_fields  # noqa: PLC0415
+    from elpd.focus.cycle import FocusCycle  # noqa: PLC0415
+    from elpd.focus.fields import result_fields  # noqa: PLC0415
     from elpd.focus.settings import CycleSettings  # noqa: PLC0415
 
     settings = CycleSettings.from_config(Config.model_validate(run.config))

@@ -18,9 +18,9 @@ from elpd.errors import DeviceError, UsageError
 from elpd.focus import guards, judging, recross, safety
 from elpd.focus.approach import WayBack, come_to_rest, verify
 from elpd.focus.ended import Ended, ended_by
-from elpd.focus.expose import AFTER_FACTOR, expose
+from elpd.focus.fields import result_fields
 from elpd.focus.passes import Play
-from elpd.focus.picture import Picture
+from elpd.focus.scene import Scene, check_roi, widened
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
 from elpd.focus.watch import Watch, WatchSettings
@@ -37,7 +37,6 @@ from elpd.records import (
     StopMode,
 )
 from elpd.units import NS_PER_MS, HostNs, after_ms
-from elpd.vision.choose import propose_roi
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.reference import reference_from_frame
 from elpd.vision.resting import LISTEN_MS
@@ -53,9 +52,6 @@ if TYPE_CHECKING:
 
 BIAS_SETTLE_MS = 10.0
 """After new biases or a new window a sensor needs a few ms before its events mean anything."""
-
-FRAME_LIMIT_MS = 500.0
-"""A camera with frames delivers one within this, or has none."""
 
 
 class Observer(Protocol):
@@ -116,8 +112,7 @@ class FocusCycle:
         self._estimate: FocusEstimate | None = None
         self._details: dict[str, Any] = {}
         self._warnings: list[str] = []
-        self.map: TemporalImage | None = None
-        """The temporal map, once exposed, for whoever wants to store or show it."""
+        self._scene = Scene(self._stage, request, settings, sink, self._phase)
 
     @property
     def reference(self) -> Reference | None:
@@ -162,14 +157,19 @@ class FocusCycle:
         self._sink.note("result", **result_fields(result))
         return result
 
+    @property
+    def map(self) -> TemporalImage | None:
+        """The temporal map, once exposed, for whoever wants to store or show it."""
+        return self._scene.map
+
     # --- the line of phases ---
 
     def _focus(self) -> tuple[Outcome, str]:
         self._phase(Phase.SETTLE_BEFORE)
         self._start_um = self._stage.to_um(self._stage.rest(REST_LIMIT_MS).steps)
-        picture = self._picture()
+        picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
-        roi, reference = self._choose(picture)
+        roi, reference = self._scene.choose(picture, self._details)
         watch = self._arm(reference, roi, frames=picture.map is None)
         if self._request.dry_run:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
@@ -190,56 +190,6 @@ class FocusCycle:
         self._phase(Phase.VERIFY)
         self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
-
-    def _picture(self) -> Picture:
-        """Get a picture of the scene: a stored one, an opening aperture's, or the newest frame."""
-        request, geometry = self._request, self._parts.camera.geometry
-        if request.reference is not None:
-            picture = Picture.of_file(request.reference, geometry)
-            if self._parts.aperture is not None:
-                self._parts.aperture.open()
-                self._stage.wait_ms(AFTER_FACTOR * self._parts.aperture.opening_ms)
-            return picture
-        if self._parts.aperture is None:
-            frame = self._stage.newest_frame(FRAME_LIMIT_MS)
-            if frame is None:
-                raise UsageError(
-                    "this camera delivers no frames and the rig has no aperture to expose with; "
-                    "give --reference IMAGE, or configure an aperture"
-                )
-            return Picture.of_frame(frame.pixels)
-        self._phase(Phase.EXPOSE)
-        self.map, (good, reason) = expose(self._stage, self._settings.transmittance)
-        if self.map is not None:
-            self._sink.note(
-                "map",
-                fired_fraction=self.map.fired_fraction,
-                hot_pixels=self.map.hot_pixels,
-                open_us=int(self.map.open_us),
-                dynamic_range_db=self.map.dynamic_range_db,
-            )
-        if self.map is None or not good:
-            raise Ended(Outcome.NO_TEXTURE, reason)
-        return Picture.of_map(self.map)
-
-    def _choose(self, picture: Picture) -> tuple[Roi, Reference]:
-        geometry = self._parts.camera.geometry
-        roi = self._request.roi
-        if roi is None:
-            side = round(self._settings.roi_fraction * min(geometry.width, geometry.height))
-            roi = propose_roi(picture.log_image, picture.valid, (side, side))
-        if roi is None:
-            raise Ended(Outcome.NO_TEXTURE, "nothing in the picture has texture above its noise; aim at a subject")
-        self._details["roi"] = [roi.x, roi.y, roi.width, roi.height]
-        reference = picture.reference(roi)
-        self._sink.note("roi", roi=self._details["roi"], texture=reference.texture, scale_px=reference.scale_px)
-        if not reference.textured:
-            raise Ended(
-                Outcome.NO_TEXTURE,
-                f"the picture shows no structure above its own noise in the ROI ({reference.texture:.1f} sigma, "
-                "at least 6 are needed); choose another ROI or add light",
-            )
-        return roi, reference
 
     def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
@@ -339,17 +289,8 @@ class FocusCycle:
                 "nothing was moved; move it to a known place (`elpd move UM`), or drive the lens by a controller that "
                 "stops: the README's table says how each does"
             )
-        geometry = self._parts.camera.geometry
-        roi = self._request.roi
-        if roi is not None and not roi.fits(geometry):
-            raise UsageError(
-                f"the ROI {roi.x},{roi.y},{roi.width},{roi.height} does not lie inside the sensor "
-                f"({geometry.width}x{geometry.height}) or is empty; give X,Y,W,H inside it"
-            )
-        if roi is not None and min(roi.width, roi.height) < 8:
-            raise UsageError(
-                f"the ROI {roi.width}x{roi.height} is too small to hold texture (at least 8x8); draw a larger one"
-            )
+        if self._request.roi is not None:
+            check_roi(self._request.roi, self._parts.camera.geometry)
 
     def _rest_um(self) -> float:
         """Return where the lens rests: by its newest report if that says so, else after waiting for one."""
@@ -447,32 +388,3 @@ class FocusCycle:
             warnings=self._told(),
             depths_um=() if self._watch is None else self._watch.depths_um,
         )
-
-
-def widened(roi: Roi, margin_px: int, width: int, height: int) -> Roi:
-    """Return *roi* grown by a margin on all sides, cut to the sensor."""
-    left, top = max(0, roi.x - margin_px), max(0, roi.y - margin_px)
-    right = min(width, roi.x + roi.width + margin_px)
-    bottom = min(height, roi.y + roi.height + margin_px)
-    return Roi(left, top, right - left, bottom - top)
-
-
-def result_fields(result: FocusResult) -> dict[str, Any]:
-    """Return the stable JSON fields of a result (tools/docs/json.md), with its details beside them."""
-    return {
-        "outcome": result.outcome.value,
-        "reason": result.reason,
-        "reversals": result.reversals,
-        "focus_um": result.focus_um,
-        "sigma_um": result.sigma_um,
-        "stop_um": result.stop_um,
-        "final_um": result.final_um,
-        "stop_latency_us": result.stop_latency_us,
-        "duration_ms": result.duration_ms,
-        "phases": [{"name": phase.name, "ms": phase.ms} for phase in result.phases],
-        "events": result.events,
-        "lost": result.lost,
-        "warnings": list(result.warnings),
-        "depths_um": list(result.depths_um),
-        "details": result.details,
-    }

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.track import RISE, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    import numpy as np
     from numpy.typing import NDArray
 
     from elpd.records import Frame, Roi
@@ -38,8 +35,3 @@ class FrameTrack:
         """Whether the newest frame is the sharpest, by more than noise could make it."""
         track = self._track
         return len(track) > 1 and track.drop == 0.0 and track.rise > RISE
-
-    def period_us(self, earlier_us: Sequence[int]) -> float | None:
-        """Return the time from one frame to the next, those at *earlier_us* too; ``None`` if there were not two."""
-        times = [*earlier_us, *(when for when, _ in self.seen)]
-        return float(np.median(np.diff(times))) if len(times) > 1 else None

@@ -212,11 +212,6 @@ class Watch:
         return self.resting.moves or self._passes.scene_moves
 
     @property
-    def frame_period_us(self) -> float | None:
-        """Time from one frame to the next, as seen so far; ``None`` if there were not two."""
-        return self._frames.period_us(self.resting.frame_times_us)
-
-    @property
     def resting_rate_hz(self) -> float:
         """Events per second that noise makes in the region: what it sends at rest, unless the scene moved."""
         return 0.0 if self.scene_moves else 1e6 * self._rest.events_per_us

@@ -12,7 +12,8 @@ from elpd import rig
 from elpd.calibrate.in_use import as_measured
 from elpd.calibrate.sensor import sensor_in_use
 from elpd.focus import stored_map
-from elpd.focus.cycle import FocusCycle, Observer, result_fields
+from elpd.focus.cycle import FocusCycle, Observer
+from elpd.focus.fields import result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.ports import Remarks
 from elpd.record.journal import RunWriter

@@ -80,7 +80,6 @@ class Resting:
         """Events of the region that are not hot pixels'."""
         self.noise_hz = 0.0
         """The same per pixel and second."""
-        self.frame_times_us: list[int] = []
         self.moves = False
         """Whether the events lie together as those of a moving scene do, known after ``settle``."""
         self.image_at_start: BuiltImage | None = None
@@ -110,7 +109,6 @@ class Resting:
         """Take frames, in time order."""
         for frame in frames:
             self._frame = frame
-            self.frame_times_us.append(int(frame.t_us))
 
     @property
     def restless(self) -> bool:
