@@ -136,7 +136,8 @@ class ModesSection(_Section):
     period_s: Annotated[float, Field(ge=1, le=604_800)] = 600.0
     """Scheduled mode: from the end of one cycle to the beginning of the next."""
     hold_off_s: Positive = 2.0
-    """Continuous mode: the least time between two cycles; doubled after each that did not find focus, to 64 times."""
+    """Continuous mode: the least time between two cycles. Doubled, to 64 times, with each that did not find focus or
+    found it where it was; after seven without focus the lens rests until somebody asks."""
     settle_s: Positive = 0.3
     """Continuous mode: so long the scene must have been quiet before the lens moves."""
     defocus_dof: Annotated[float, Field(ge=1, le=20)] = 2.0

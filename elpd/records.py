@@ -239,7 +239,7 @@ class ElpSample:
     All sums are exact integers. ``elp`` has the units of the weight table, ``energy`` is ``Σ w²`` over the same
     events, ``n_on`` and ``n_off`` count events inside the ROI, ``n_capped`` those that a pixel's rate cap refused.
     ``position_um`` is the lens position at the middle of the window and ``travel_um`` how far it moved in it, both
-    ``nan`` where no lens path is known.
+    ``nan`` where no lens path is known. ``shed_us`` of the window were not looked at, because too much was waiting.
     """
 
     begin_us: SensorUs
@@ -251,6 +251,7 @@ class ElpSample:
     n_capped: int = 0
     position_um: float = float("nan")
     travel_um: float = float("nan")
+    shed_us: int = 0
 
 
 class Cancel(IntEnum):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+import structlog
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.extending import intrinsic
 
@@ -65,6 +67,17 @@ class _Cache(FunctionCache):  # type: ignore[misc]  # numba ships no types
             filename_base=self._impl.filename_base,
             source_stamp=(self._impl.locator.get_source_stamp(), _taken_in(function)),
         )
+        self._kernel = f"{function.__module__}.{function.__name__}"
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what is kept for a signature; a torn or foreign file is forgotten, said, and written anew."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # noqa: BLE001  (a damaged pickle raises anything)
+            with suppress(OSError):  # a cache that cannot be written is not used at all
+                self.flush()
+            structlog.get_logger().warning("damaged kernel made anew", kernel=self._kernel, reason=repr(error))
+            return None
 
 
 def _taken_in(function: Any) -> str:

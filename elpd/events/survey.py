@@ -18,7 +18,7 @@ import numpy as np
 
 from elpd.errors import UsageError
 from elpd.events.evt2 import HIGH_BITS, LOW_BITS
-from elpd.events.evt3 import WORDS, skip_to_time, take_rare_word
+from elpd.events.evt3 import WORDS, skip_to_time, take_rare_words
 from elpd.events.jit import kernel
 from elpd.events.registers import (
     COUNT_BEFORE_CONTROLLER,
@@ -137,8 +137,8 @@ def survey_evt3(
                 mask = np.uint32(mask & (mask - np.uint32(1)))
         elif kind in (0xE, 0xF, 0x7, 0xA):
             counts, before, after = state[RATE_COUNTS], state[RATE_BEFORE], state[RATE_AFTER]
-            subtype = state[OTHERS_SUBTYPE]
-            take_rare_word(word, (loop << 24) + (high << 12) + low, state, triggers)
+            subtype = word & 0xFFF if kind == 0xE else state[OTHERS_SUBTYPE]
+            i = take_rare_words(words, i, (loop << 24) + (high << 12) + low, state, triggers)
             if state[RATE_COUNTS] == counts:
                 continue
             if subtype == COUNT_BEFORE_CONTROLLER:

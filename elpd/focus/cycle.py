@@ -416,6 +416,7 @@ class FocusCycle:
         told = [*self._warnings, *guards.of_loss(self._stage.lost_events)]
         if self._watch is not None:
             told += guards.of_marks(self._stage.marks)
+            told += guards.of_shedding(self._watch.shedding.shed_us)
             roi, frame = self._watch.roi, self._stage.frame
             told += guards.of_rate(self._watch.rate.plateau_mev_s())
             told += guards.of_frame(

@@ -84,6 +84,17 @@ def of_loss(lost_events: int) -> list[str]:
     return [f"{lost_events} events were lost; choose a smaller ROI, a slower sweep or higher contrast thresholds"]
 
 
+def of_shedding(shed_us: int) -> list[str]:
+    """Return what there is to tell of slices of a sweep that this computer had no time for."""
+    if shed_us == 0:
+        return []
+    told = (
+        f"{shed_us / 1000:.1f} ms of the sweep were not looked at, because events came faster than this computer takes "
+        "them; choose a smaller ROI, a slower sweep or higher contrast thresholds, or give it more of the processor"
+    )
+    return [told]
+
+
 def of_rate(plateau_mev_s: float | None) -> list[str]:
     """Return what there is to tell of a read-out that is full."""
     if plateau_mev_s is None:

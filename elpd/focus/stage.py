@@ -17,6 +17,7 @@ from elpd.units import NS_PER_MS, HostNs, SensorUs, Steps, after_ms
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.focus.shedding import Shedding
     from elpd.ports import RigParts
     from elpd.records import CameraPacket, Frame, LensReport, Trigger
 
@@ -55,6 +56,8 @@ class Stage:
         self._edges = EdgeReader() if wired else None
         self.marks = 0 if wired else None
         """How many position marks were believed; ``None`` where none are wired."""
+        self.shedding: Shedding | None = None
+        """Lets packets go while too much waits; only a sweep cannot wait."""
         self.interrupt: Callable[[], None] | None = None
         """Asked before every read; raises to end the phase."""
 
@@ -105,6 +108,8 @@ class Stage:
                     f"camera: no data for {silent_ms:.0f} ms (limit {SILENCE_MS:.0f}); check its cable and power"
                 )
             return None
+        if self.shedding is not None:
+            packet = self.shedding.take(packet)
         self.packets += 1
         self.last_packet_ns = packet.received_ns
         self.lost_events += packet.lost_events

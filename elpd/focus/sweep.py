@@ -82,6 +82,13 @@ class Sweep:
 
     def run(self, plan: SweepPlan) -> SweepReport:
         """Sweep until something is certain; the lens has been told to stop or is to be reversed when this returns."""
+        self._stage.shedding = self._watch.shedding
+        try:
+            return self._run(plan)
+        finally:
+            self._stage.shedding = None
+
+    def _run(self, plan: SweepPlan) -> SweepReport:
         stage, watch, lens = self._stage, self._watch, self._stage.parts.lens
         begun_ns = stage.now_ns()
         begun_um = stage.to_um(lens.position_at(begun_ns).steps)

@@ -20,6 +20,7 @@ from elpd.focus.heading import Heading
 from elpd.focus.lamplight import Lamplight, weighed
 from elpd.focus.passes import NO_PLAY, Pass, Passes, Play
 from elpd.focus.placed import Placed
+from elpd.focus.shedding import Shedding
 from elpd.records import Direction
 from elpd.units import SensorUs
 from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
@@ -135,6 +136,8 @@ class Watch:
         """What the sensor says at rest."""
         self.rate = RateWatch()
         """Whether the read-out is full."""
+        self.shedding = Shedding(roi, geometry)
+        """What of a sweep is not looked at when there is too much of it."""
         self._lamp: Lamplight | None = None
         self._windows: ElpWindows | None = None
         self._rest = RestingRate()
@@ -259,15 +262,18 @@ class Watch:
         needed_um = SLOW_SHARE * 1e-6 * self._settings.speed_um_s
         for row in self._windows.feed(packet):
             sample = self._net(self._placed.sample(row))
+            duration_us = sample.end_us - sample.begin_us
+            if self.shedding.shed_us:
+                sample = replace(sample, shed_us=self.shedding.within(sample.begin_us, sample.end_us))
             samples.append(sample)
             self.events += sample.n_on + sample.n_off
-            duration_us = sample.end_us - sample.begin_us
             if sample.begin_us < self._begun_us or self._sign * sample.travel_um < needed_um * duration_us:
                 continue
             ticked = self._tick(sample, sample.position_um + 0.5 * sample.travel_um)
             if self._sign * sample.position_um < self._judge_from:
                 continue
-            self._heading.feed(sample, self._memory, ticked=ticked)
+            if 2 * sample.shed_us < duration_us:  # a window that was hardly looked at says nothing
+                self._heading.feed(sample, self._memory, ticked=ticked)
             far = self._memory.track.drop > FAR_DROP
             if self._heading.seen_ahead and not self._passed and far and self._memory.peak_passed:
                 self._passed = True

@@ -36,6 +36,8 @@ pytestmark = [
 ]
 
 PATIENCE_S = 120.0
+AFTER_THE_RECORDING_US = 22_000_000
+TURN_US = 1 << 24
 WIDTH, HEIGHT = 1280, 720
 SETTINGS = {
     "serial": "00050567",
@@ -53,8 +55,14 @@ class Rig:
 
     def __init__(self, bus: usbfs.Bus) -> None:
         self.bus, self.evk4 = bus, Evk4()
+        self.now_us = AFTER_THE_RECORDING_US
         bus.plug(self.evk4)
         self.camera: CapturedCamera = neuromorphic.open_camera(SETTINGS, MonotonicClock())
+
+    def later(self) -> int:
+        """Return a time of the sensor's clock after all before: tests may run in any order."""
+        self.now_us += 200_000
+        return self.now_us
 
     def packets(self, last_us: int) -> Iterator[CameraPacket]:
         """Yield what is delivered until the events of *last_us* have come."""
@@ -64,7 +72,8 @@ class Rig:
             if packet is None:
                 continue
             yield packet
-            if packet.complete_until_us is not None and packet.complete_until_us >= last_us - STEP_BACK_US:
+            until_us = packet.complete_until_us
+            if until_us is not None and (until_us + STEP_BACK_US - last_us) % TURN_US < TURN_US // 2:
                 return
         raise AssertionError(f"{last_us} us did not come within {PATIENCE_S:g} s")
 
@@ -129,6 +138,9 @@ def test_it_is_what_was_plugged_in(rig: Rig) -> None:
 def test_a_real_recording_arrives_bit_for_bit_in_packets_of_any_size(started: Rig) -> None:
     content = (RECORDINGS / "evk4_10s.raw").read_bytes()
     body = b"".join(itertools.dropwhile(lambda line: line.startswith(b"%"), content.splitlines(keepends=True)))
+    if started.now_us > AFTER_THE_RECORDING_US:  # its clock would jump back
+        started.camera.close()
+        started.camera.start()
     decoder = Evt3Decoder(Geometry(WIDTH, HEIGHT))
     received, columns, until_us = hashlib.sha256(), [], 0
     for packet in started.streamed(pieces(body)):
@@ -191,47 +203,52 @@ def open_lines(registers: dict[int, int], first: int, count: int) -> list[int]:
 def test_what_the_usb_loses_is_a_gap_and_counted(started: Rig) -> None:
     """The library is busy with a register while packets pour in: its ring of 48 overflows, ours is never reached."""
     evk4, camera = started.evk4, started.camera
-    evk4.send(words_at(22_000_000))
-    assert len(list(started.packets(22_000_000))) == 1
+    begin_us = started.later()
+    evk4.send(words_at(begin_us))
+    assert len(list(started.packets(begin_us))) == 1
     evk4.answering.clear()
     for number in range(200):
-        evk4.send(words_at(22_000_100 + 10 * number))
+        evk4.send(words_at(begin_us + 100 + 10 * number))
     evk4.answer_when_sent()
     assert isinstance(camera, Temperature)
     assert camera.temperature_c() == pytest.approx(39.0)
     # The requests that found no room throw away what they bring before they are of use again.
-    further = (words_at(22_010_000 + 1_000 * number) for number in range(200))
+    further = (words_at(begin_us + 10_000 + 500 * number) for number in range(200))
     gaps, seen = 0, 0
     while gaps == 0:
         evk4.send(next(further))
         packet = camera.read(0.01)
         if packet is not None:
             gaps, seen = gaps + packet.gap_before, seen + 1
-    started.wait_for(lambda: camera.counters["usb_overflows"] == 1)
+    started.wait_for(lambda: camera.counters["usb_overflows"] > 0)
     assert 100 <= camera.counters["usb_packets_dropped"] < 300
     assert seen < 200
 
 
 def test_events_that_the_rate_controller_held_back_are_lost_events(started: Rig) -> None:
     pair = np.array([0xE014, 0xF064, 0xF000, 0x7000, 0xE016, 0xF03C, 0xF000, 0x7000], "<u2").tobytes()
-    started.evk4.send(words_at(22_200_000) + pair)
-    packets = list(started.packets(22_200_000))
+    at_us = started.later()
+    started.evk4.send(words_at(at_us) + pair)
+    packets = list(started.packets(at_us))
     assert [(packet.gap_before, packet.lost_events) for packet in packets] == [(True, 40)]
     started.wait_for(lambda: started.camera.counters["rate_controller_dropped"] == 40)
 
 
 def test_trigger_edges_come_with_their_packet(started: Rig) -> None:
     edges = np.array([0xA601, 0xA600], "<u2").tobytes()
-    started.evk4.send(words_at(22_300_000) + edges)
-    (packet,) = started.packets(22_300_000)
-    assert [(edge.t_us, edge.id, edge.rising) for edge in packet.triggers] == [
-        (22_300_000, 6, True),
-        (22_300_000, 6, False),
+    at_us = started.later()
+    started.evk4.send(words_at(at_us) + edges)
+    (packet,) = started.packets(at_us)
+    # A stream that begins in the middle of the clock's turn counts turns from there.
+    assert [(edge.t_us % TURN_US, edge.id, edge.rising) for edge in packet.triggers] == [
+        (at_us % TURN_US, 6, True),
+        (at_us % TURN_US, 6, False),
     ]
 
 
 def test_unplugged_and_plugged_in_again(started: Rig) -> None:
     camera = started.camera
+    before = camera.counters["reopened"]
     started.bus.unplug()
     with pytest.raises(CameraError, match=r"unplugged \(no device\)"):
         started.wait_for(lambda: False)
@@ -243,10 +260,11 @@ def test_unplugged_and_plugged_in_again(started: Rig) -> None:
     while not camera.reopen() and time.monotonic() < until:
         time.sleep(0.01)  # the driver sleeps through 2.5 s of opening
     camera.start()
-    started.evk4.send(words_at(1_000_000))
-    (packet,) = started.packets(1_000_000)
+    at_us = started.later()
+    started.evk4.send(words_at(at_us))
+    (packet,) = started.packets(at_us)
     assert not packet.gap_before
-    assert camera.counters["reopened"] == 1
+    assert camera.counters["reopened"] == before + 1
 
 
 def test_a_stalled_endpoint_is_a_lost_camera(started: Rig) -> None:

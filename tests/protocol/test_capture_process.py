@@ -282,3 +282,14 @@ def test_the_child_ends_with_its_controller() -> None:
         assert process is not None
         process._control.close()
         assert process._child.wait(PATIENCE_S) == 0
+
+
+def test_a_child_that_is_told_to_end_gives_the_camera_back(tmp_path: Path) -> None:
+    with opened(closed=str(tmp_path / "note"), every_s=0.001) as camera:
+        camera.start()
+        process = camera._process
+        assert process is not None
+        process._child.terminate()
+        with pytest.raises(CameraError, match=r"its process ended with status 0; start it again"):
+            read_on(camera)
+        assert (tmp_path / "note").read_text() == "closed"

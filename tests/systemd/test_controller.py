@@ -289,7 +289,7 @@ def test_stopping_closes_the_socket_and_nothing_starts_it_again(controller: Cont
 
 
 def test_kernels_are_kept_where_the_rest_is_read_only(controller: Controller) -> None:
-    listed = ("find", "/var/cache/elpd/numba", "-path", "*/events_*", "-name", "*.nbi", "-printf", "%u %p\\n")
+    listed = ("find", "/var/cache/elpd/numba", "-name", "evt2.decode_*.nbi", "-printf", "%u %p\\n")
     before = controller.machine(*listed).stdout.splitlines()
     assert all(line.startswith("elpd ") for line in before)
     gone, damaged = (line.split()[1] for line in before[:2])

@@ -2,7 +2,7 @@
 
     python tools/examples/mqtt_bridge.py [--broker HOST[:PORT]] [--prefix elpd] [--socket PATH]
 
-Published: ``PREFIX/online`` (``1``, and ``0`` by the broker when this ends; retained), ``PREFIX/status`` (retained, anew
+Published: ``PREFIX/online`` (``1``, and ``0`` by the broker when this ends; retained), ``PREFIX/status`` (retained, new
 with every change), ``PREFIX/state``, ``PREFIX/result``, ``PREFIX/fault``, ``PREFIX/phase``. Taken: ``PREFIX/do/METHOD``
 with the parameters as a JSON object, or nothing; the answer goes to ``PREFIX/answer/METHOD``, with the request's key
 ``id``, if it has one. A command that a broker has kept (retained) is not taken: nobody is there who means it now.

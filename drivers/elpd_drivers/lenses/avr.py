@@ -39,7 +39,7 @@ SWITCH_STEPS = 32
 SETTLING_SPS = 2000.0
 """A rotor takes a single step at about this speed, however slowly the next one comes."""
 
-START_STEPS, TURN_STEPS = 0.5, 2.5
+START_STEPS, TURN_STEPS = 0.5, 4.0
 """How far its ramps stray from the ideal, from rest and through rest, one standard deviation, seen on the firmware."""
 
 SAMPLED_US = 70.0
@@ -93,7 +93,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
     def build(table: AvrSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
         sampled_ns = round(SAMPLED_US * NS_PER_US)
-        motor = Motor(Timing(sampled_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.0))
+        motor = Motor(Timing(sampled_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.5))
         return DirectLens(
             AvrController(table, clock, line, motor, latency), line, motor, clock, latency, poll_ms=table.query_ms
         )
