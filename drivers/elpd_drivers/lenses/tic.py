@@ -276,9 +276,7 @@ class TicController:
         reply = parse_reply(bytes(self._received), crc=self._settings.crc_responses)
         self._received.clear()
         # it homes at speeds of its own settings
-        if reply is None or (
-            abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps and not reply.flags & wire.HOMING
-        ):
+        if reply is None or (abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps and not reply.flags & wire.HOMING):
             return None  # the silence limit counts on; the next query resynchronises
         self._newest = reply
         velocity = reply.velocity_sps
