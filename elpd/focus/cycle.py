@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from elpd.errors import DeviceError, UsageError
 from elpd.focus import guards, judging, recross, safety
 from elpd.focus.approach import WayBack, come_to_rest, verify
-from elpd.focus.ended import Ended, ended_by
+from elpd.focus.aside import stand_aside
+from elpd.focus.ended import Beside, Ended, ended_by
 from elpd.focus.fields import result_fields
 from elpd.focus.passes import Play
 from elpd.focus.scene import Scene, check_roi, widened
@@ -173,7 +174,12 @@ class FocusCycle:
         watch = self._arm(reference, roi, frames=picture.map is None)
         if self._request.dry_run:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
-        passed = self._search(watch)
+        try:
+            passed = self._search(watch)
+        except Beside:
+            passed = self._search_from_aside()
+            assert self._watch is not None, "it was armed anew"
+            watch = self._watch
         self._phase(Phase.STOP)
         sign = self._details["sweep_sign"]
         assert passed.stop is not None, "a sweep that has passed focus sent its stop"
@@ -234,7 +240,20 @@ class FocusCycle:
         watch.under_a_lamp(resting.flicker, speed_um_s)
         self._warnings.append(guards.of_lamp(resting.flicker, speed_um_s))
 
-    def _search(self, watch: Watch) -> SweepReport:
+    def _search_from_aside(self) -> SweepReport:
+        """Go off focus, where the lens began in it, and look for it as from anywhere else: with a picture of there."""
+        turned = self._reversals
+        self._stage.listener, self._stage.interrupt = None, self._interrupt
+        towards = stand_aside(self._stage, self._settings, int(self._details["sweep_sign"]))
+        picture = self._scene.picture()
+        self._phase(Phase.CHOOSE)
+        roi, reference = self._scene.choose(picture, self._details)
+        try:
+            return self._search(self._arm(reference, roi, frames=picture.map is None), towards)
+        finally:
+            self._reversals += turned
+
+    def _search(self, watch: Watch, from_aside: int = 0) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
         self._phase(Phase.PROBE)
         search = Search(
@@ -248,6 +267,7 @@ class FocusCycle:
             observe=self._observe,
             cancelled=self._cancelled,
             interrupt=self._interrupt,
+            from_aside=from_aside,
         )
         try:
             return search.run()

@@ -20,6 +20,10 @@ class Ended(Exception):  # noqa: N818  (an early end of the cycle, not an error)
         self.reason = reason
 
 
+class Beside(Ended):
+    """Focus lies behind whichever way the lens goes: it began in focus, or beside it."""
+
+
 def ended_by(verdict: Verdict) -> Exception:
     """Return what a rule's verdict is to raise: a camera's fault, or an early end."""
     if verdict.action is Action.FAULT:

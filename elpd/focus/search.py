@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 from elpd.focus import safety
-from elpd.focus.ended import Ended, ended_by
+from elpd.focus.ended import Beside, Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR
 from elpd.focus.stage import REST_LIMIT_MS
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
@@ -52,6 +52,8 @@ class Search:
         Where notes go, and who hears of phases and windows.
     cancelled, interrupt
         Whether somebody wants an end, and what ends a wait.
+    from_aside
+        In which direction focus lies, where the lens has just gone off it on purpose; else 0.
 
     """
 
@@ -68,7 +70,9 @@ class Search:
         observe: Callable[[ElpSample, float], None],
         cancelled: Callable[[], int],
         interrupt: Callable[[], None],
+        from_aside: int = 0,
     ) -> None:
+        self._from_aside = from_aside
         self._stage = stage
         self._lens = stage.parts.lens
         self._watch = watch
@@ -140,6 +144,9 @@ class Search:
                     continue  # far from focus a lens may go a long way before anything changes
                 raise ended_by(report.verdict)
             dark = dark and report.end is SweepEnd.RULE and report.dark
+            if report.end is SweepEnd.BEHIND and turned_at_um is not None and not self._from_aside:
+                self.reversals += 1
+                raise Beside(Outcome.NO_CROSSING, "focus seemed to lie behind both ways")
             if self.reversals >= self._settings.max_reversals:
                 if lit and dark:
                     raise Ended(
@@ -183,6 +190,8 @@ class Search:
         return bool(answers > LIT_SHARE * watch.roi.width * watch.roi.height)
 
     def _first_sign(self) -> int:
+        if self._from_aside:
+            return self._from_aside
         if self._settings.first_direction != "auto":
             return 1 if self._settings.first_direction == "up" else -1
         limits = self._lens.limits
