@@ -267,9 +267,11 @@ def is_run(folder: Path) -> bool:
 
 
 def _new_folder(parent: Path, started_utc: datetime) -> Path:
-    """Make ``<UTC time>-<nnn>``, the first that nobody has yet."""
-    for number in range(1, 1000):
-        folder = parent / f"{started_utc:%Y%m%dT%H%M%SZ}-{number:03d}"
+    """Make ``<UTC time>-<nnn>``, after all that are there: names sort by age, whatever was deleted meanwhile."""
+    second = f"{started_utc:%Y%m%dT%H%M%SZ}"
+    taken = [int(name) for path in parent.glob(f"{second}-???") if (name := path.name[-3:]).isdigit()]
+    for number in range(max(taken, default=0) + 1, 1000):
+        folder = parent / f"{second}-{number:03d}"
         try:
             folder.mkdir()
         except FileExistsError:

@@ -178,7 +178,6 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
         (["focus", "--config", "absent.toml"], 2, "ConfigError", "No such file"),
         (["focus", "--config", "text.txt"], 2, "ConfigError", "line 1"),
         (["focus", "--config", "typo.toml"], 2, "ConfigError", "typo.toml:2"),
-        (["focus", "--set", "sim.board=theia"], 2, "UsageError", "cannot be stopped while it moves"),
         (
             ["focus", "--set", "lens.driver=abacus"],
             2,

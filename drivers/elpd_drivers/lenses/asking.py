@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 LATE_MS = 6.0
 """No controller here takes so long to answer where it is, its wire time included; an FTDI left alone mostly does."""
 
-REMEMBERED = 15
-"""Answers that the usual wait is taken of; a change of adapter shows within a tenth of a second."""
+REMEMBERED = 5
+"""Answers that the usual wait is taken of; few, because a slow line gives few in a cycle."""
 
 
 class Asking:
