@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from elpd.focus.stage import Stage
 
 ASIDE_DOF = 10.0
-"""From so far off focus is found as from anywhere; nearer, the approach makes too few events to be told for one."""
+"""A cycle that begins in focus sees both ways lead away from it. From 2.5 depths of focus beside it none of ten found
+it, from 5 all did (simulated rig, five seeds, both sides); this is twice that."""
 
 
 def stand_aside(stage: Stage, settings: CycleSettings, sign: int) -> int:

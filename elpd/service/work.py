@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import UsageError
 from elpd.focus import stored_map
-from elpd.focus.settings import CycleSettings, FocusRequest
+from elpd.focus.settings import FocusRequest
 from elpd.record.session import focus_on
-from elpd.records import Cancel, Outcome, Roi
+from elpd.records import Outcome, Roi
 from elpd.service.attention import STILL_S
 from elpd.service.codec import plain
 from elpd.service.messages import FocusAnswer, FocusParams, HomeAnswer, MoveAnswer, MoveParams, PresetAnswer
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from elpd.service.kept import Kept
     from elpd.service.messages import Preset, PresetParams, RecordParams, Result, RoiBox
     from elpd.service.situation import Situation
-
-ASIDE_DOF = 10.0
-"""A cycle that begins in focus sees both ways lead away from it. From 2.5 depths of focus beside it none of ten found
-it, from 5 all did (simulated rig, five seeds, both sides); this is twice that."""
 
 
 class Work:
@@ -92,7 +88,7 @@ class Work:
         self._situation.focusing(on=True)
         begun_s = time.monotonic()
         try:
-            session = self._cycles(job, request, parts, config)
+            session = self._cycle(job, request, parts, config)
         finally:
             self._situation.focusing(on=False)
         self.session = session
@@ -104,24 +100,6 @@ class Work:
         self._situation.ended(answer)
         return answer
 
-    def _cycles(self, job: Job, request: FocusRequest, parts: RigParts, config: Config) -> Session:
-        """Run a cycle from where the lens is or, where that is focus already, from beside it."""
-        movable = not request.dry_run and request.reference is None
-        here_um = self.moves.here_um(parts)
-        aside = movable and self.focused_at(here_um) is not None
-        if aside:
-            self._stand_aside(job, here_um, parts, config)
-        session = self._cycle(job, request, parts, config)
-        if movable and not aside and _saw_both_ways_behind(session, config):
-            aside = True
-            self._stand_aside(job, here_um, parts, config)
-            session = self._cycle(job, request, parts, config)
-        if aside and session.result.outcome is not Outcome.FOCUSED and config.focus.on_failure == "start":
-            sign = self.focused_at(here_um) or 0
-            arrival = self.moves.approach(job, here_um, sign, parts, config, Cancel.HOLD)
-            session = replace(session, result=replace(session.result, final_um=arrival.um))
-        return session
-
     def _cycle(self, job: Job, request: FocusRequest, parts: RigParts, config: Config) -> Session:
         with self._attention.without_signs(STILL_S):
             interrupted = self._attention.question(job, parts.lens, moving=False)
@@ -129,17 +107,6 @@ class Work:
         if job.why_cancelled and session.result.outcome is Outcome.CANCELLED:
             session = replace(session, result=replace(session.result, reason=job.why_cancelled))
         return session
-
-    def _stand_aside(self, job: Job, here_um: float, parts: RigParts, config: Config) -> None:
-        """Go off focus, to the side that it was found from or, where there is no room, to the other."""
-        off_um = ASIDE_DOF * CycleSettings.from_config(config).depth_of_focus_um
-        limits = parts.lens.limits
-        low_um, high_um = parts.scale.to_um(limits.min_steps), parts.scale.to_um(limits.max_steps)
-        sign = self.focused_at(here_um) or 1
-        target_um = here_um - sign * off_um
-        if not low_um <= target_um <= high_um:
-            target_um = here_um + sign * off_um
-        self.moves.to(job, min(max(target_um, low_um), high_um), parts, config)
 
     def _moved(self, job: Job, params: MoveParams, parts: RigParts, config: Config) -> MoveAnswer:
         """Go there; what the daemon does by itself keeps to the side that focus was found from."""
@@ -185,12 +152,6 @@ def focus_answer(session: Session) -> FocusAnswer:
     fields = session.fields()
     fields["run"] = None if session.run is None else session.run.name
     return FocusAnswer.model_validate(plain(fields))
-
-
-def _saw_both_ways_behind(session: Session, config: Config) -> bool:
-    """Say whether a cycle ended as one does that began in focus: turned round as often as it may, nothing found."""
-    result = session.result
-    return result.outcome is Outcome.NO_CROSSING and result.reversals >= max(1, config.focus.max_reversals)
 
 
 def _target_um(params: MoveParams, parts: RigParts) -> float:
