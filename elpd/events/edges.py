@@ -7,20 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.events.registers import new_state, new_triggers, take_triggers
-from elpd.events.split import split_evt2, split_evt3, split_evt21
+from elpd.events.split import SPLITTERS
 from elpd.records import Encoding, Trigger
 from elpd.units import SensorUs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from elpd.records import CameraPacket
 
-_SPLITTERS: dict[Encoding, Callable[..., int]] = {
-    Encoding.EVT3: split_evt3,
-    Encoding.EVT2: split_evt2,
-    Encoding.EVT21: split_evt21,
-}
 _NEVER = 1 << 62
 _TURN = {Encoding.EVT3: 1 << 24, Encoding.EVT2: 1 << 34, Encoding.EVT21: 1 << 34}
 """After how many microseconds the encoding's own time begins anew."""
@@ -35,7 +28,7 @@ class EdgeReader:
 
     def of(self, packet: CameraPacket) -> tuple[Trigger, ...]:
         """Return the edges of the next packet, oldest first, in the packet's own time."""
-        splitter = _SPLITTERS.get(packet.encoding)
+        splitter = SPLITTERS.get(packet.encoding)
         if splitter is None:
             return packet.triggers
         splitter(np.ascontiguousarray(packet.data), 0, self._state, _NEVER, self._triggers)

@@ -23,8 +23,11 @@ from elpd.events.evt2 import (
 from elpd.events.evt3 import WORDS, skip_to_time, take_rare_word
 from elpd.events.jit import kernel
 from elpd.events.registers import HIGH, LOOP, LOW
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 
@@ -116,3 +119,11 @@ def split_evt21(
                 state[LOW] = t & 0x3F
         position += 1
     return position
+
+
+SPLITTERS: dict[Encoding, Callable[..., int]] = {
+    Encoding.EVT3: split_evt3,
+    Encoding.EVT2: split_evt2,
+    Encoding.EVT21: split_evt21,
+}
+"""The kernel for each encoding in words."""

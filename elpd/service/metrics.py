@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from elpd.service.messages import Status
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
 _UM, _US, _MS, _MB = 1e-6, 1e-6, 1e-3, 1e6
 
 Kind = Literal["gauge", "counter"]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from elpd.errors import LensError, UnreferencedError
 from elpd.focus.settings import CycleSettings
 from elpd.motion.errand import Errands
-from elpd.records import Cancel
 
 if TYPE_CHECKING:
     from elpd.config import Config
@@ -44,9 +43,9 @@ class Moves:
                     raise UnreferencedError(f"homing was stopped on request; home the lens again ({error})") from None
                 raise
 
-    def to(self, job: Job, target_um: float, parts: RigParts, config: Config, least: Cancel = Cancel.RETURN) -> Arrival:
-        """Go to a place; a cancellation of at least *least* ends it."""
-        return self._errands(job, parts, least).move_to(target_um, CycleSettings.from_config(config).speed_um_s)
+    def to(self, job: Job, target_um: float, parts: RigParts, config: Config) -> Arrival:
+        """Go to a place."""
+        return self._errands(job, parts).move_to(target_um, CycleSettings.from_config(config).speed_um_s)
 
     def by(self, job: Job, by_um: float, parts: RigParts, config: Config) -> Arrival:
         """Go so much further."""
@@ -59,26 +58,25 @@ class Moves:
         sign: int,
         parts: RigParts,
         config: Config,
-        least: Cancel = Cancel.RETURN,
     ) -> Arrival:
         """Go to a place and arrive there from the side that *sign* says (0: whichever), the play taken up."""
         low_um, high_um = self._errands(job, parts).limits_um
         play_um = CycleSettings.from_config(config).backlash_um + APPROACH_MARGIN_UM
         if sign * (target_um - self.here_um(parts)) < 0:
-            arrival = self.to(job, min(max(target_um - sign * play_um, low_um), high_um), parts, config, least)
+            arrival = self.to(job, min(max(target_um - sign * play_um, low_um), high_um), parts, config)
             if arrival.cancelled:
                 return arrival
-        return self.to(job, target_um, parts, config, least)
+        return self.to(job, target_um, parts, config)
 
     def here_um(self, parts: RigParts) -> float:
         """Return where the lens is now."""
         return parts.scale.to_um(parts.lens.position_at(parts.clock.now_ns()).steps)
 
-    def _errands(self, job: Job, parts: RigParts, least: Cancel = Cancel.RETURN) -> Errands:
+    def _errands(self, job: Job, parts: RigParts) -> Errands:
         interrupted = self._attention.question(job, parts.lens, moving=True)
 
         def asked() -> bool:
             self._situation.update_lens(position_um=self.here_um(parts), moving=True)
-            return interrupted() >= least
+            return bool(interrupted())
 
         return Errands(parts.clock, parts.lens, parts.scale, asked)

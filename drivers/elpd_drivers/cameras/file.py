@@ -23,13 +23,13 @@ from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.evt2 import HIGH_BITS, LOW_BITS
 from elpd.events.layout import event_columns
 from elpd.events.registers import HIGH, new_state, new_triggers, take_triggers, time_of
-from elpd.events.split import split_evt2, split_evt3, split_evt21
+from elpd.events.split import SPLITTERS
 from elpd.events.stream import EventStream, open_recording
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import NS_PER_S, NS_PER_US, HostNs, SensorUs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import Clock, EventCamera, RecordingReader
     from elpd.records import Frame, Trigger
@@ -37,11 +37,6 @@ if TYPE_CHECKING:
 PIECE_BYTES = 1 << 20
 DEFAULT_PACKET_US = 1000
 FOREVER_US = 1 << 62
-SPLITTERS: dict[Encoding, Callable[..., int]] = {
-    Encoding.EVT3: split_evt3,
-    Encoding.EVT2: split_evt2,
-    Encoding.EVT21: split_evt21,
-}
 
 
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> EventCamera:
