@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,21 @@ def test_the_inertial_sensor_keeps_time_in_the_dark() -> None:
     assert (first.events, len(first.data)) == (0, 0)
     assert second.complete_until_us == (first.complete_until_us or 0) + 1000
     assert opened.read(0.0) is None
+
+
+def test_inertial_samples_are_in_our_units_and_count_from_our_origin() -> None:
+    opened, camera = source()
+    camera.batches["Imu"] += [[dv.IMU(EPOCH_US, 30, 0, 0, -1, 0, 90, 0, 0, 0, 0)]] * 2
+    packet = opened.read(0.0)
+    assert packet is not None
+    (sample,) = packet.imu
+    assert (sample.t_us, sample.temperature_c) == (1_000_000, 30)
+    assert sample.acceleration_m_s2 == (0, 0, -9.80665)
+    assert sample.rotation_rad_s == (0, math.pi / 2, 0)
+    opened.call("enable_imu", [False])
+    silent = opened.read(0.0)
+    assert silent is not None
+    assert silent.imu == ()
 
 
 def test_a_frame_is_dated_by_the_middle_of_its_exposure_and_known_after_its_read_out() -> None:

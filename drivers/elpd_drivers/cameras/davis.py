@@ -1,4 +1,4 @@
-"""iniVation cameras through the maker's dv-processing: events, a DAVIS346's frames with their exposure, triggers.
+"""iniVation cameras through the maker's dv-processing: events, a DAVIS346's frames with their exposure, triggers, IMU.
 
 The library hands each stream out by itself and says nothing of how far it is. What dates a packet is the newest stamp
 in it, of events, of the inertial sensor (a thousand a second, also in the dark) or of a frame; a promise of
@@ -18,12 +18,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from elpd.errors import CameraError, ConfigError
-from elpd.records import BiasSet, Encoding, Frame, Geometry, Trigger
+from elpd.records import BiasSet, Encoding, Frame, Geometry, ImuSample, Trigger
 from elpd.units import US_PER_S, SensorUs
 from elpd_drivers.cameras.capture import CapturedCamera, open_captured
 from elpd_drivers.cameras.refusals import explain
 from elpd_drivers.cameras.ring import Captured
 from elpd_drivers.cameras.source import CaptureSettings, SourceFacts, layout_of, need, read_table
+from elpd_drivers.inertia import acceleration_m_s2, rotation_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,7 +62,8 @@ class DavisSettings(CaptureSettings):
     """The table ``[camera]`` for the driver ``davis``.
 
     ``exposure_us`` is a number or ``"auto"``. ``interval_us`` is how often the library commits what it has: the
-    shorter, the sooner a packet comes and the more packets there are. ``frames`` and ``trigger`` switch those streams.
+    shorter, the sooner a packet comes and the more packets there are. ``frames``, ``trigger`` and ``imu`` switch those
+    streams.
     """
 
     exposure_us: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
@@ -69,6 +71,7 @@ class DavisSettings(CaptureSettings):
     interval_us: Annotated[int, Field(ge=1_000, le=10_000)] = 1_000
     frames: bool = True
     trigger: bool = True
+    imu: bool = True
     biases: BiasTables = BiasTables()
 
 
@@ -110,6 +113,7 @@ class DavisSource:
         self._origin_us: int | None = None
         self._newest_us = 0
         self._frames = 0
+        self._with_imu = table.imu
         self._configure()
         width, height = camera.getEventResolution()
         self.facts = SourceFacts(
@@ -119,7 +123,7 @@ class DavisSource:
             serial=str(camera.getSerialNumber()),
             min_latency_us=table.interval_us if table.min_latency_us is None else table.min_latency_us,
             layout=layout_of(EVENTS),
-            abilities=("window", "biases", "trigger") if self._is_davis else ("window", "trigger"),
+            abilities=("window", *(("biases",) if self._is_davis else ()), "trigger", "imu"),
         )
 
     def read(self, timeout_s: float) -> Captured | None:
@@ -144,6 +148,8 @@ class DavisSource:
         elif name == "apply_biases":
             biases = self._table.biases
             self._set_biases(biases.expose if BiasSet(arguments[0]) is BiasSet.EXPOSE else biases.focus)
+        elif name == "enable_imu":
+            self._with_imu = bool(arguments[0])
         else:
             self._camera.setDetectorRunning(bool(arguments[0]))
 
@@ -163,7 +169,9 @@ class DavisSource:
         camera, table = self._camera, self._table
         camera.setTimeInterval(timedelta(microseconds=table.interval_us))
         camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
-        camera.setImuRunningAccelerometer(True)
+        camera.setImuRunningAccelerometer(True)  # delivered or not, it keeps time in the dark
+        camera.setImuRunningGyroscope(True)
+        camera.setImuRunningTemperature(True)
         camera.setDetectorRisingEdges(True)
         camera.setDetectorFallingEdges(True)
         camera.setDetectorRunning(table.trigger)
@@ -226,6 +234,7 @@ class DavisSource:
             events=0 if events is None else len(events),
             frames=() if frame is None else (_frame(frame, origin_us),),
             triggers=() if edges is None else tuple(self._edges(edges, origin_us)),
+            imu=tuple(_samples(motion, origin_us)) if motion and self._with_imu else (),
         )
 
     def _array(self, events: Any, origin_us: int) -> np.ndarray[Any, np.dtype[Any]]:
@@ -264,3 +273,16 @@ def _frame(frame: Any, origin_us: int) -> Frame:
         exposure_us,
         np.array(frame.image),
     )
+
+
+def _samples(batch: Sequence[Any], origin_us: int) -> list[ImuSample]:
+    """Return the library's inertial samples, in m/s^2 and rad/s."""
+    return [
+        ImuSample(
+            SensorUs(one.timestamp - origin_us),
+            acceleration_m_s2((one.accelerometerX, one.accelerometerY, one.accelerometerZ)),
+            rotation_rad_s((one.gyroscopeX, one.gyroscopeY, one.gyroscopeZ)),
+            one.temperature,
+        )
+        for one in batch
+    ]
