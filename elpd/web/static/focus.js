@@ -4,7 +4,7 @@ import { urgent } from "./api.js";
 import { createChart } from "./chart.js";
 import { $, facts, make, say, show } from "./dom.js";
 import { trouble } from "./notices.js";
-import { live } from "./store.js";
+import { mayOperate } from "./store.js";
 import { PHASES, PHASE_NAMES, ms, outcomeText, phaseText, sigma, um } from "./words.js";
 
 export function mountFocus(store, { act }) {
@@ -30,7 +30,7 @@ export function mountFocus(store, { act }) {
 
   store.listen((state) => {
     const running = state.state === "FOCUSING" || Boolean(state.cycle && !state.cycle.result && state.cycle.phase);
-    const may = live(state) && state.link.role !== "observe";
+    const may = mayOperate(state);
     $("focus").disabled = !may || running || state.fault !== null || state.state !== "READY";
     say($("focus"), running ? "Focusing…" : $("dry-run").checked ? "Try without moving" : "Focus");
     $("focus").dataset.busy = running ? "yes" : "";
