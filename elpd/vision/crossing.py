@@ -21,6 +21,7 @@ from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_
 from elpd.vision.drift import Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
 from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
+from elpd.vision.light import worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
 from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
@@ -38,6 +39,11 @@ WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 SYSTEMATIC_IMAGE = 0.04
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
+
+SMOOTH_PAIRS = 0.01
+"""How far, in widths of the curve, midpoints of bright pixels' pairs lie from those of dark ones for other reasons than
+lag, as a standard deviation over a picture's brightness: 27 still sweeps through four lenses have 0.007, and 0.010
+where the lens is aberrated most. Surfaces have their own brightness, and lenses their own focus for each size."""
 
 STILL = 0.1
 """Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
@@ -81,13 +87,17 @@ COARSE_FRAMES = 0.25
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
 
-WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
-"""Thresholds per unit of log intensity that are tried: sensors have 3 to 20, and losses make it more."""
+WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0)
+"""Thresholds per unit of log intensity that are tried where nothing tells: sensors have 3 to 20, and below the dark
+current a unit of log intensity is more light than it seems."""
+
+NEAR_WORTHS = (0.5, 0.71, 1.0, 1.41, 2.0)
+"""What is tried of the worth that the light's conservation tells: from one frame it is right to a factor of two."""
 
 TICKS = 64
 FEWEST_TICKS = 24
 LEVELS_AT_ONCE = 3 << 18
-"""Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt, because a lens waits for them."""
+"""Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt where a lens waits for them."""
 
 STILL_SHARE = 0.9
 SAMPLE_PX = 1 << 15
@@ -198,6 +208,8 @@ def ask_events(
     start: NDArray[np.float32] | None = None,
     calibrated: LagPrior | None = None,
     dark: float = DARK,
+    *,
+    hurried: bool = True,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
@@ -205,6 +217,7 @@ def ask_events(
     photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
     typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
     *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
+    *hurried* says that a lens waits.
     *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
     *brightness* does not show, relative to the brightest parts.
     """
@@ -214,8 +227,10 @@ def ask_events(
     groups = by_pixel(events)
     at_peak = rebuilt(events, groups, np.array([peak]))[0]
     slownesses = _slownesses(start, at_peak, slowness)
+    worths = _worths(start, at_peak, events.margin)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
-    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated)
+    smooth = SMOOTH_PAIRS * flank_width(begin, peak)
+    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth)
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
     if planes:
         depths = tuple(plane.at for plane in planes)
@@ -227,13 +242,16 @@ def ask_events(
         start = None if start is None else start[rows]
         groups = by_pixel(events)
     pixels = max(1, events.height * events.width)
-    ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
+    count = int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)) if hurried else TICKS
+    ticks = np.linspace(begin, end, count)
     images = rebuilt(events, groups, ticks)
     drift = find_drift(images)
-    first = _image_focus(_curves(images, None, weight, events.margin)[0], ticks, peak)
-    curves = [] if _stray(pairs) < STILL else _curves(images, start, weight, events.margin)
+    still = _stray(pairs) < STILL
+    loud = _curves(images, None if still else start, worths, weight, events.margin)
+    first = _image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
-    curves += _curves(images, start, weight, events.margin)
+    quiet = _curves(images, start, worths, weight, events.margin)
+    curves = quiet if still else loud + quiet
     candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
     image = average_focus(candidates) if candidates else None
     energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
@@ -281,14 +299,26 @@ def _slownesses(
     return found
 
 
+def _worths(start: NDArray[np.float32] | None, level: NDArray[np.float32], margin: int) -> tuple[float, ...]:
+    """Return how many thresholds a unit of log intensity may be, where *level* is what *start* changed by to focus."""
+    worth = None
+    if start is not None:
+        worth = worth_of_an_event(cv2.GaussianBlur(start, (0, 0), 1.0), level, margin)
+    return WORTHS if worth is None else tuple(one / worth for one in NEAR_WORTHS)
+
+
 def _curves(
-    images: NDArray[np.float32], start: NDArray[np.float32] | None, weight: NDArray[np.float32], margin: int
+    images: NDArray[np.float32],
+    start: NDArray[np.float32] | None,
+    worths: tuple[float, ...],
+    weight: NDArray[np.float32],
+    margin: int,
 ) -> list[NDArray[np.float64]]:
     """Return candidates of log S, (ticks, bands): of the images as they are, and with the start picture below them.
 
     Events count changes since their first; what was there before, the blurred start picture, is missing. In a still
     scene that is as symmetric in defocus as the picture itself. In one that moves, the picture wanders over what is
-    missing, and S wavers. How many thresholds a unit of log intensity is worth nobody knows, so several are tried.
+    missing, and S wavers. What it is worth in events is known roughly at best, so several *worths* are tried.
     """
     own = np.array([band_products(image, image, weight, margin) for image in images])
     curves = [own]
@@ -296,7 +326,7 @@ def _curves(
         below = np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32)
         mixed = np.array([band_products(image, below, weight, margin) for image in images])
         under = band_products(below, below, weight, margin)
-        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in WORTHS]
+        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in worths]
     return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
 
 
@@ -375,6 +405,7 @@ def _pair_mode(
     slownesses: list[NDArray[np.float64]],
     unmeasured_lag: float,
     calibrated: LagPrior | None,
+    smooth: float,
 ) -> tuple[Mode | None, _Lateness]:
     """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
@@ -390,7 +421,7 @@ def _pair_mode(
     near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
     slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
     typical = [float(np.average(one, weights=near)) for one in slow]
-    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past) for one in slow]
+    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past, smooth) for one in slow]
     # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
     doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
     late = [

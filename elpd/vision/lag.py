@@ -104,10 +104,12 @@ def line_of_classes(
     slowness: NDArray[np.float64],
     mode: float,
     width: float,
+    smooth: float = 0.0,
 ) -> Line | None:
     """Return the line of pairs' midpoints against slowness; ``None`` if there is none.
 
-    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say.
+    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say. *smooth*
+    is the standard deviation of what changes with brightness as smoothly as lag and is none: no scatter shows it.
     """
     order = np.argsort(slowness, kind="stable")
     order = order[np.abs(middle[order] - mode) <= 3.0 * width]
@@ -125,7 +127,8 @@ def line_of_classes(
     x, y = np.array(slow) - np.mean(slow), np.array(late) - np.mean(late)
     slope = float(x @ y / (x @ x))
     variance = float(np.square(y - slope * x).sum()) / (x.size - 2)
-    return Line(slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24)), sqrt(variance), x.size)
+    scattered = max(NEIGHBOURS * variance / float(x @ x), 1e-24)
+    return Line(slope, sqrt(scattered + smooth**2 / float(np.mean(x * x))), sqrt(variance), x.size)
 
 
 def expected_lag(line: Line | None, median: float) -> Lag:
