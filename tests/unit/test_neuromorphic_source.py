@@ -110,7 +110,7 @@ def test_arrays_frames_and_edges_of_a_davis346() -> None:
     )
     opened = source(device)
     assert (opened.facts.encoding, opened.facts.geometry) == (Encoding.ARRAY, Geometry(346, 260))
-    assert opened.facts.abilities == ("window", "biases", "mask", "imu")
+    assert opened.facts.abilities == ("biases", "mask", "imu")
     packet = opened.read(0.0)
     assert packet is not None
     assert (packet.events, packet.complete_until_us, packet.backlog, packet.gap_before) == (2, 1234, 2, False)
@@ -133,21 +133,16 @@ def test_arrays_frames_and_edges_of_a_davis346() -> None:
     assert device.closed == 1
 
 
-def test_a_davis346_takes_windows_masks_and_biases() -> None:
+def test_a_davis346_takes_masks_and_biases() -> None:
     device = Device("inivation_davis346")
     opened = source(device, biases={"expose": {"onbn": 1500}, "focus": {"onbn": 1600}}, exposure_us=700)
-    opened.call("set_window", [[10, 20, 30, 40]])
-    assert device.configuration is not None
-    window = device.configuration.region_of_interest
-    assert (window.left, window.top, window.width, window.height) == (10, 20, 30, 40)
     opened.call("apply_biases", ["expose"])
+    assert device.configuration is not None
     assert device.configuration.biases.onbn == 1500
     assert opened.call("set_mask", [[[1, 0], [0, 2]]]) == 2
     assert device.configuration.pixel_mask == (2, 1 + 2 * 346, 0, 0, 0, 0, 0, 0)
-    assert device.configuration.region_of_interest == window, "what was set before stays"
+    assert device.configuration.biases.onbn == 1500, "what was set before stays"
     assert device.configuration.exposure_us == 700
-    opened.call("set_window", [None])
-    assert device.configuration.region_of_interest == nd.inivation_davis346.RegionOfInterest()
 
 
 def test_a_dvxplorer_has_biases_and_no_more() -> None:

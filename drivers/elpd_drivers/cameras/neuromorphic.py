@@ -196,10 +196,7 @@ class NeuromorphicSource:
         )
 
     def _window(self, window: list[int] | None) -> dict[str, Any]:
-        width, height = self.facts.geometry.width, self.facts.geometry.height
-        if self._kind == "inivation_davis346":
-            x, y, w, h = window or [0, 0, width, height]
-            return {"region_of_interest": self._module.RegionOfInterest(left=x, top=y, width=w, height=h)}
+        height = self.facts.geometry.height
         mask = self._module.RowColumnMask(set=window is not None)
         if window is not None:
             x, y, w, h = window
@@ -233,7 +230,8 @@ class NeuromorphicSource:
 def _abilities(kind: str, configuration: Any) -> list[str]:
     known = {field.name for field in fields(configuration)}
     abilities = {
-        "window": bool(known & {"x_mask", "region_of_interest"}),
+        # Of a DAVIS346, too, the library can set one, but with it switches the frames off until it opens anew.
+        "window": "x_mask" in known,
         "biases": "biases" in known,
         "mask": kind in MASK_SLOTS,
         "imu": kind.startswith("inivation"),
