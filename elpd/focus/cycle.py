@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
 from elpd.focus import guards, judging, recross, safety
+from elpd.focus.aftermath import WatchSettings
 from elpd.focus.approach import WayBack, come_to_rest, verify
 from elpd.focus.aside import stand_aside
 from elpd.focus.ended import Beside, Ended, ended_by
@@ -24,7 +25,7 @@ from elpd.focus.passes import Play
 from elpd.focus.scene import Scene, check_roi, widened
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
-from elpd.focus.watch import Watch, WatchSettings
+from elpd.focus.watch import Watch
 from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
     BiasSet,
@@ -186,7 +187,7 @@ class FocusCycle:
         way = WayBack(self._stage, self._settings, sign)
         ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
-        first, furthest_um = watch.estimate(), ended.um
+        first, furthest_um = watch.after.estimate(), ended.um
         if recross.is_needed(watch):
             first, furthest_um = self._pass_again(watch, first, sign)
             way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
@@ -292,11 +293,11 @@ class FocusCycle:
                 "the sign changed, but no estimator agrees on where; try again with a larger ROI or more light",
             )
         self._estimate = estimate
-        self._warnings += guards.of_depths(watch.depths_um) + guards.of_late_lamp(watch.flicker)
+        self._warnings += guards.of_depths(watch.after.depths_um) + guards.of_late_lamp(watch.after.flicker)
         self._details["method"] = estimate.method
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
-        lost = self._stage.lost_events if watch.gap_near_crossing else None
+        lost = self._stage.lost_events if watch.after.gap_near_crossing else None
         judging.demand(estimate, self._settings, sign, way_um, lost)
         return estimate
 

@@ -187,8 +187,10 @@ class EventMemory:
         """Return a lamp's flicker, if the events show one."""
         if self._count == 0:
             return None
-        t_us, on = self._t_us, self._columns[3][: self._count]
-        return find_flicker(t_us, on, int(t_us[0]), int(t_us[-1]) + 1)
+        t_us = self._t_us
+        _, x, y, on = (column[: self._count] for column in self._columns)
+        pixel = y.astype(np.int64) * self._shape[1] + x
+        return find_flicker(t_us, pixel, on, int(t_us[0]), int(t_us[-1]) + 1)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
