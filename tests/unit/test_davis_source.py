@@ -133,6 +133,15 @@ def test_an_unplugged_camera_is_an_error() -> None:
     opened.close()
 
 
+def test_a_clock_that_was_set_back_is_another_epoch() -> None:
+    opened, camera = source()
+    camera.batches["Event"] += [store([(EPOCH_US + at, 1, 2, True)]) for at in (5_000_000, 4_500_000, 3_900_000)]
+    for _ in range(2):
+        assert opened.read(0.0) is not None, "streams are handed out out of step"
+    with pytest.raises(CameraError, match=r"its clock jumped back by 1\.100 s; it was reset, start again"):
+        opened.read(0.0)
+
+
 def test_wrong_tables_say_so() -> None:
     with pytest.raises(ConfigError, match=r"camera\.biases\.focus\.on: a DAVIS346 has no such bias; it has .*Diff.*On"):
         source(biases={"focus": {"on": (1, 2)}})

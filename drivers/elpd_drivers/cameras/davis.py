@@ -43,6 +43,9 @@ EVENTS = np.dtype({
 READ_OUT_US = 9_200
 """From the end of an exposure to the end of its read-out, in a recording of a DAVIS346 (the library does not say)."""
 
+CLOCK_JUMP_US = US_PER_S
+"""Nothing on the way from the sensor's streams to here takes a second; a sensor that was reset does."""
+
 TURN_S = 0.0003
 """The library's streams can only be asked, not waited for; this is a third of the shortest commit interval."""
 
@@ -225,6 +228,7 @@ class DavisSource:
         if self._origin_us is None and stamps:
             self._origin_us = min(stamps) - US_PER_S
         origin_us = self._origin_us or 0
+        self._watch_clock(stamps)
         self._newest_us = max([self._newest_us, *(stamp - origin_us for stamp in stamps)])
         self._frames += frame is not None
         return Captured(
@@ -236,6 +240,12 @@ class DavisSource:
             triggers=() if edges is None else tuple(self._edges(edges, origin_us)),
             imu=tuple(_samples(motion, origin_us)) if motion and self._with_imu else (),
         )
+
+    def _watch_clock(self, stamps: Sequence[int]) -> None:
+        """Raise ``CameraError`` if the camera's clock was set back: streams are out of step, but not by a second."""
+        back_us = self._newest_us - (max(stamps, default=0) - (self._origin_us or 0))
+        if stamps and back_us > CLOCK_JUMP_US:
+            raise CameraError(f"camera: its clock jumped back by {back_us / US_PER_S:.3f} s; it was reset, start again")
 
     def _array(self, events: Any, origin_us: int) -> np.ndarray[Any, np.dtype[Any]]:
         """Copy the library's events, which are a view of its own memory, counted from our origin."""
