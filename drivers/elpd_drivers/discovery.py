@@ -177,4 +177,4 @@ def _holder(node: Path, processes: Path = Path("/proc")) -> str | None:
 def _is_ours(command: bytes) -> bool:
     """Say whether a command line is elpd's, or that of the process that reads a camera for it."""
     words = command.decode(errors="replace").split("\0")
-    return CHILD in words or any(Path(word).name == "elpd" for word in words[:2]) or ["-m", "elpd"] == words[1:3]
+    return CHILD in words or any(Path(word).name == "elpd" for word in words[:2]) or words[1:3] == ["-m", "elpd"]
