@@ -325,7 +325,9 @@ def test_unplugged_and_plugged_in_again(started: Rig) -> None:
 
 
 def test_a_stalled_endpoint_is_a_lost_camera(started: Rig) -> None:
-    started.lost = True
     started.davis.stall()
     with pytest.raises(CameraError, match="its USB endpoint stalled; unplug it and plug it in again"):
         started.wait_for(lambda: False)
+    started.begin_anew()
+    started.words.events([(1000, 2, 3, True)])
+    assert started.hear("events").columns == [[1000], [2], [3], [True]]
