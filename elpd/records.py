@@ -85,6 +85,20 @@ class Trigger:
 
 
 @dataclass(frozen=True, slots=True)
+class ImuSample:
+    """What a camera's inertial sensor said at one time, in the axes of the camera's maker.
+
+    ``acceleration_m_s2`` and ``rotation_rad_s`` are (x, y, z); at rest the first has the length of gravity. ``nan``
+    where the sensor does not measure it.
+    """
+
+    t_us: SensorUs
+    acceleration_m_s2: tuple[float, float, float]
+    rotation_rad_s: tuple[float, float, float]
+    temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
 class CameraPacket:
     """What one ``EventCamera.read`` returned.
 
@@ -103,6 +117,7 @@ class CameraPacket:
     gap_before: bool = False
     lost_events: int = 0
     backlog: int = 0
+    imu: tuple[ImuSample, ...] = ()
 
 
 class BiasSet(Enum):

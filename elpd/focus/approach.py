@@ -134,14 +134,14 @@ def come_to_rest(stage: Stage, watch: Watch, stop: CommandStamp, way: WayBack, s
     """
     capabilities = stage.parts.lens.capabilities
     ended_ns = after_ms(stop.done_ns, capabilities.stop_onset_ms)
-    watch.turn(stage.sensor_clock.to_sensor(ended_ns))
+    watch.after.turn(stage.sensor_clock.to_sensor(ended_ns))
     if capabilities.abrupt_stop and capabilities.native_velocity:
-        way.set_out(watch.roughly_um)
-        watch.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
+        way.set_out(watch.after.roughly_um)
+        watch.after.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
         stage.hear(safety.CAMERA_SILENCE_MS)
     else:
         stage.rest(REST_LIMIT_MS)
-        watch.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
+        watch.after.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
     return standstill(stage, watch, stop, sign)
 
 
@@ -157,12 +157,12 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
             f"the lens rests {error_um:+.1f} um from where it was sent; check the motor current and the mechanics",
         )
     stage.hear(safety.CAMERA_SILENCE_MS)
-    score = watch.return_score(focus_um)
-    from_um = stage.position_um(watch.back_from_us)
+    score = watch.after.return_score(focus_um)
+    from_um = stage.position_um(watch.after.back_from_us)
     resting_hz, way_back_um = watch.resting_rate_hz, abs(from_um - focus_um)
-    passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.back_from_us)) / NS_PER_S
-    seen = watch.events_back - round(resting_hz * passed_s)
-    expected = watch.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
+    passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.after.back_from_us)) / NS_PER_S
+    seen = watch.after.events_back - round(resting_hz * passed_s)
+    expected = watch.after.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if score is not None and score >= RETURN_SIGMAS:
         return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:

@@ -136,7 +136,7 @@ class Search:
                 reason=report.verdict.reason,
             )
             if report.end is SweepEnd.PASSED:
-                self._stage.listener, self._stage.interrupt = watch.hear_out, self._interrupt
+                self._stage.listener, self._stage.interrupt = watch.after.hear_out, self._interrupt
                 return report
             if report.end is SweepEnd.RULE and report.verdict.outcome is not Outcome.NO_CROSSING:
                 if report.verdict.outcome is Outcome.TOO_FEW_EVENTS and self._in_the_light():

@@ -15,7 +15,7 @@ from elpd import rig
 from elpd.calibrate.profile import state_directory
 from elpd.errors import FaultLatchedError, UnavailableError, UnreferencedError, UsageError
 from elpd.records import Cancel, StopMode
-from elpd.service import archive
+from elpd.service import archive, memory
 from elpd.service.attention import Attention
 from elpd.service.autopilot import Autopilot
 from elpd.service.backroom import Backroom, answer_of
@@ -289,6 +289,7 @@ class RigEngine:
             budget_bytes = 1e6 * self.config.journal.budget_mb
             directory = self.config.journal.directory
             self.backroom.also(lambda: archive.keep_budget(directory, budget_bytes))
+            self.backroom.also(memory.trim)
         self.autopilot.ended(job, answer, self._work.session)
         self.backroom.also(self._save)
 

@@ -76,6 +76,11 @@ class _Urb:
     length: int
     setup: bytes = b""
 
+    @property
+    def written(self) -> int:
+        """How many bytes the host sends with it."""
+        return self.length - (len(self.setup) if self.endpoint == _CONTROL_OUT else 0)
+
 
 class Bus:
     """One USB port and the environment in which a program sees it; the device can come and go."""
@@ -234,7 +239,7 @@ class _OpenDevice:
                 urb, status, data = done
                 if data:
                     self._write(urb.buffer + (8 if urb.kind == _CONTROL_URB else 0), data)
-                actual = urb.length if urb.endpoint in range(0x80) else len(data)
+                actual = len(data) if urb.endpoint & 0x80 and urb.endpoint != _CONTROL_OUT else urb.written
                 self._write(urb.address + _STATUS_AT, struct.pack("=i", status))
                 self._write(urb.address + _ACTUAL_AT, struct.pack("=i", actual))
                 self._write(argument, struct.pack("=Q", urb.address))

@@ -9,7 +9,7 @@ import pytest
 from engines import ME, Daemon
 
 from elpd import rig
-from elpd.errors import FaultLatchedError, LensError, UnreferencedError
+from elpd.errors import ConfigError, FaultLatchedError, LensError, UnreferencedError
 from elpd.service.keeper import LAST_RETRY_S
 
 if TYPE_CHECKING:
@@ -88,7 +88,10 @@ def test_a_camera_that_falls_silent_while_idle_is_a_fault(tmp_path: Path) -> Non
     assert "no data for 1" in daemon.status.fault.message
 
 
-def test_a_rig_that_stays_away_is_tried_again_with_growing_patience(tmp_path: Path) -> None:
+@pytest.mark.parametrize("refusal", [LensError, ConfigError])
+def test_a_rig_that_stays_away_is_tried_again_with_growing_patience(
+    tmp_path: Path, refusal: type[LensError | ConfigError]
+) -> None:
     attempts: list[float] = []
     daemons: list[Daemon] = []
     gone = True
@@ -96,7 +99,7 @@ def test_a_rig_that_stays_away_is_tried_again_with_growing_patience(tmp_path: Pa
     def build(config: Config) -> RigParts:
         attempts.append(daemons[0].time.now_s())
         if gone:
-            raise LensError("lens port /dev/lens0: there is no such port; plug the controller in")
+            raise refusal("lens port /dev/lens0: there is no such port; plug the controller in")
         return rig.build(config)
 
     daemon = Daemon(tmp_path, build=build)
