@@ -1,10 +1,11 @@
 """What a sensor says while lens and scene rest: its noise, its hot pixels, and whether the light flickers.
 
 A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
-than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
-told from a hand that shakes. Where signs lie together as those of one moving edge do, the scene moves: then its image
-is gone on with when the sweep begins, on a picture that is laid where the scene is now, and what motion alone does to
-the image's sharpness is measured.
+than independent signs would, or lie together more than they do by chance, somebody should listen a little longer
+(``restless``): a lamp needs several periods to be told from a hand that shakes, and a dull scene some hundred events.
+Where signs lie together as those of one moving edge do, the scene moves: then its image is gone on with when the sweep
+begins, on a picture that is laid where the scene is now, and what motion alone does to the image's sharpness is
+measured.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ HOT_SIGMAS = 5.0
 HOT_EVENTS = 3.0
 """A pixel is hot where it fires this many standard deviations and events more often than its second busiest neighbour:
 an edge that trembles makes neighbours fire alike. By chance one in 10⁸ pixels does."""
+
+SIGMAS_OF_SUSPICION = 2.0
+"""Order above which it is worth while to listen longer: one still scene in forty-four pays for it."""
 
 SIGMAS_OF_MOTION = 4.0
 """How much more order than independent events have shows that the scene moved while the lens stood still. A false
@@ -126,11 +130,13 @@ class Resting:
 
     @property
     def restless(self) -> bool:
-        """Whether ON and OFF events swing together more than independent ones would."""
-        t_us, _, on = self._events()
+        """Whether ON and OFF events swing together, or lie together, more than independent ones would."""
+        t_us, pixel, on = self._events()
         bins = self.duration_us // RESTLESS_BIN_US
         if bins < 3 or t_us.size < bins:
             return False
+        if order(self._levels(pixel, on)) > SIGMAS_OF_SUSPICION:
+            return True
         which = np.clip((t_us - (self._begin_us or 0)) // RESTLESS_BIN_US, 0, bins - 1)
         sign = 2.0 * on - 1.0
         mean = float(sign.mean())
