@@ -137,6 +137,11 @@ class EventMemory:
         stamp_events(x[part], y[part], on[part], POINT, levels)
         return BuiltImage(levels, self._forgotten + self._count)
 
+    def change(self) -> NDArray[np.float32]:
+        """Return what the events of this memory alone have built, those after the last ``advance`` too."""
+        levels = self.built().levels
+        return levels if self._start is None else levels - self._start.levels
+
     def _make_room(self, count: int) -> None:
         """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""
         used, capacity = self._count, self._columns[0].size
