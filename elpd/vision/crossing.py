@@ -11,6 +11,7 @@ here depends on scene, optics or speed. Witnesses that disagree beyond their err
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import cv2
@@ -94,6 +95,10 @@ UNANSWERED = 0.23
 WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0)
 """Thresholds per unit of log intensity that are tried where nothing tells: sensors have 3 to 20, and below the dark
 current a unit of log intensity is more light than it seems."""
+
+GHOSTLESS_BANDS = 1
+"""Of a scene that moves, the image that events built from nothing holds the negative of what they began from, which
+stays behind: blurred as that was, it is in the coarse bands, and only the finer ones show the scene alone."""
 
 NEAR_WORTHS = (0.5, 0.71, 1.0, 1.41, 2.0)
 """What is tried of the worth that the light's conservation tells: from one frame it is right to a factor of two."""
@@ -262,8 +267,13 @@ def ask_events(
     first = _image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
     quiet = _curves(images, start, worths, weight, events.margin)
+    bands = [len(BANDS_PX) if still else GHOSTLESS_BANDS, *len(worths) * [len(BANDS_PX)]]
     curves = quiet if still else loud + quiet
-    candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
+    candidates = [
+        one
+        for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
+        if (one := _image_focus(curve, ticks, peak, count)) is not None
+    ]
     image = average_focus(candidates) if candidates else None
     energy, turning = _who_turns(at_peak, bend, weight)
     lags, expected = late.candidates, late.typical
@@ -367,7 +377,9 @@ def _curves(
     return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
 
 
-def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float) -> BandFocus | None:
+def _image_focus(
+    curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float, bands: int = len(BANDS_PX)
+) -> BandFocus | None:
     """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record."""
     end = float(ticks[-1])
     wide = fit_vertex(ticks, curve[:, 0], end - float(ticks[0]))
@@ -376,7 +388,7 @@ def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: f
     use = ticks <= end - UNANSWERED * wide.width
     if int(use.sum()) < 5:
         return None
-    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width)
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands)
     if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
         return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
