@@ -46,6 +46,7 @@ from elpd.vision.resting import LISTEN_MS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.focus.picture import Picture
     from elpd.focus.settings import CycleSettings, FocusRequest
     from elpd.focus.sweep import SweepReport
     from elpd.ports import RigParts, RunSink
@@ -172,7 +173,7 @@ class FocusCycle:
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        watch = self._arm(reference, roi, frames=picture.map is None)
+        watch = self._arm(reference, roi, picture)
         if self._request.dry_run:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         try:
@@ -198,7 +199,7 @@ class FocusCycle:
         self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
 
-    def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
+    def _arm(self, reference: Reference, roi: Roi, picture: Picture) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
         camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
@@ -214,11 +215,15 @@ class FocusCycle:
             roi,
             geometry,
             WatchSettings(
-                settings.speed_um_s, settings.depth_of_focus_um, Play.up_to(settings.backlash_um), frames=frames
+                settings.speed_um_s,
+                settings.depth_of_focus_um,
+                Play.up_to(settings.backlash_um),
+                frames=picture.map is None,
             ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
             sensor,
+            picture.levels,
         )
         self._watch = watch
         self._stage.listener = watch.rest
@@ -250,7 +255,7 @@ class FocusCycle:
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
         try:
-            return self._search(self._arm(reference, roi, frames=picture.map is None), towards)
+            return self._search(self._arm(reference, roi, picture), towards)
         finally:
             self._reversals += turned
 

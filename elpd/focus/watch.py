@@ -20,6 +20,9 @@ from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from elpd.records import CameraPacket, Direction, ElpSample, Frame, Geometry, Roi, SensorProfile
     from elpd.units import SensorUs
     from elpd.vision.flicker import Flicker
@@ -53,6 +56,8 @@ class Watch:
         Makes weights of a newer frame, for cameras that have frames.
     sensor
         What a calibration knows of the sensor.
+    picture
+        Makes the first picture: log brightness in contrast thresholds, (height, width) of the sensor.
     """
 
     def __init__(
@@ -64,6 +69,7 @@ class Watch:
         locate: Callable[[SensorUs], float],
         rereference: Rereference | None = None,
         sensor: SensorProfile | None = None,
+        picture: Callable[[], NDArray[np.float32]] | None = None,
     ) -> None:
         self.roi = roi
         self._settings = settings
@@ -77,6 +83,7 @@ class Watch:
             speed_um_s=settings.speed_um_s,
             locate=locate,
             sensor=sensor,
+            picture=picture,
         )
         self.shedding = Shedding(roi, geometry)
         """What of a sweep is not looked at when there is too much of it."""
@@ -159,9 +166,7 @@ class Watch:
             settings.depth_of_focus_um,
             lit=self.lit,
         )
-        heading = Heading.of_sweep(
-            hearing.rest_rate, hearing.memory, again=turned_at_um is not None, scene_moves=self.scene_moves
-        )
+        heading = Heading.of_sweep(hearing.rest_rate, hearing.resting, again=turned_at_um is not None)
         self._course = Course(leg, hearing.memory, FrameTrack(self.roi, follow=self.scene_moves), heading)
         self._after = Aftermath(hearing, self._course, settings, self._locate)
         self.events = 0

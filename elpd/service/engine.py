@@ -313,6 +313,8 @@ class RigEngine:
             log.warning("state damaged", reason=self._kept.complaint)
         if kept.open:
             log.warning("daemon ended badly before")
+            why = "the daemon before did not end in order; the lens may be anywhere: home it"
+            self.situation.warn("ended-badly", why)
 
     def _save(self) -> None:
         try:

@@ -216,6 +216,7 @@ class Worker:
         self._situation.update_lens(moving=False)
         if job.request.method == "home":
             self._keeper.needs_home = False
+            self._situation.unwarn("ended-badly")
             self._situation.update_lens(referenced=True)
         try:
             self._idle.tell_lens(parts, parts.lens.poll(), needs_home=self._keeper.needs_home)

@@ -20,7 +20,8 @@ from elpd.records import FocusEstimate
 from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
 from elpd.vision.drift import Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
-from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
+from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, weights_of_lines
+from elpd.vision.light import in_focus, worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
 from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
@@ -68,6 +69,10 @@ PAIRS_KERNEL = 0.15
 LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
+
+LAG_UNEXPLAINED_IN_FOCUS = 0.2
+"""The same where the events have told what the picture is in focus: slowness is then right to a tenth, and a receptor's
+delay of a level that turns is its time constant to another one."""
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
@@ -157,6 +162,8 @@ class EventWitnesses:
     """How far the scene went across the sensor meanwhile."""
     expected_lag: Lag = field(default_factory=Lag)
     """What the image would have been freed of if no pair had been asked."""
+    in_focus: bool = False
+    """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
     def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
@@ -169,6 +176,8 @@ class EventWitnesses:
             return found
         width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
+        if self.in_focus:
+            unexplained = min(unexplained, LAG_UNEXPLAINED_IN_FOCUS)
         shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         stray = _stray(self.pairs)
         departure = 0.0
@@ -212,8 +221,9 @@ def ask_events(
     if brightness is None and calibrated is not None:
         calibrated = calibrated.unseen()
     groups = by_pixel(events)
-    at_peak = rebuilt(events, groups, np.array([peak]))[0]
-    slownesses = _slownesses(start, at_peak, slowness)
+    before, at_peak, after = rebuilt(events, groups, np.array([begin, peak, end]))
+    bend = at_peak - 0.5 * (before + after)
+    slownesses, focused = _slownesses(start, at_peak, slowness, events.margin)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
     pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated)
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
@@ -222,7 +232,8 @@ def ask_events(
         return EventWitnesses(None, planes[0], late.typical, 0.0, depths, flank_width(begin, peak))
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
         rows = busiest_rows(events, SAMPLE_PX)
-        events, weight, at_peak = rows_of(events, rows), weight[rows], at_peak[rows]
+        events, weight = rows_of(events, rows), weight[rows]
+        at_peak, bend = at_peak[rows], bend[rows]
         slownesses = [one[rows] for one in slownesses]
         start = None if start is None else start[rows]
         groups = by_pixel(events)
@@ -236,10 +247,10 @@ def ask_events(
     curves += _curves(images, start, weight, events.margin)
     candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
     image = average_focus(candidates) if candidates else None
-    energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
+    energy, turning = _who_turns(at_peak, bend, weight)
     lags, expected = late.candidates, late.typical
     if energy.any():
-        typical = [float(np.average(slow, weights=energy)) for slow in slownesses]
+        typical = [_typical(slow, turning, energy) for slow in slownesses]
         unasked = _lag_of(None, unmeasured_lag / typical[0], calibrated)
         expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
@@ -248,7 +259,29 @@ def ask_events(
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
-    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected)
+    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=focused)
+
+
+def _who_turns(
+    level: NDArray[np.float32], bend: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where S is at its peak, and which pixels make it fall again; both (height, width).
+
+    S has its energy on both sides of an edge, but it turns where the level of a pixel does, which is the dark side:
+    ``S" = 2·sum of L"·B(A·B·L)``. *bend* stands for L".
+    """
+    band = band_image(level, BANDS_PX[0])
+    weighted = np.asarray(band * weight, dtype=np.float32)
+    return weighted * band, np.asarray(bend * band_image(weighted, BANDS_PX[0]), dtype=np.float32)
+
+
+def _typical(slowness: NDArray[np.float64], turning: NDArray[np.float32], energy: NDArray[np.float32]) -> float:
+    """Return how slow the image is: the mean over what turns, or over its energy where it does not turn as a whole."""
+    by_energy = float(np.average(slowness, weights=energy))
+    total = float(turning.sum())
+    if total <= 0.0:
+        return by_energy
+    return float(np.clip((slowness * turning).sum() / total, slowness.min(), slowness.max()))
 
 
 def _by_brightness(
@@ -264,21 +297,25 @@ def _by_brightness(
 
 
 def _slownesses(
-    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
-    """Return candidates of how slow each pixel is: as in the picture, and as it was in focus, by its events.
+    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64], margin: int
+) -> tuple[list[NDArray[np.float64]], bool]:
+    """Return candidates of how slow each pixel is, and whether they are of the picture in focus.
 
-    A pixel is as slow as the light that it has when it answers, and the start picture was blurred. What its events are
-    worth in log intensity nobody knows.
+    A pixel is as slow as the light that it has when it turns, and the start picture was blurred. What an event is worth
+    in log intensity follows from that a lens makes no light; where it does not, several worths are tried.
     """
     if start is None:
-        return [slowness]
+        return [slowness], False
+    smooth = cv2.GaussianBlur(start, (0, 0), 1.0)
+    worth = worth_of_an_event(smooth, level, margin)
+    if worth is not None:
+        return [(1.0 + DARK) / (in_focus(smooth, level, worth, margin) + DARK)], True
     found = [slowness]
-    for worth in WORTHS:
+    for one in WORTHS:
         bright = np.maximum(start.astype(np.float64), 0.0) + DARK
-        lit = bright * np.exp(np.clip(level.astype(np.float64) / worth, -5.0, 5.0))
+        lit = bright * np.exp(np.clip(level.astype(np.float64) / one, -5.0, 5.0))
         found.append((1.0 + DARK) / np.clip(lit, DARK, 1.0 + DARK))
-    return found
+    return found, False
 
 
 def _curves(
@@ -379,7 +416,9 @@ def _pair_mode(
     """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     past = end - peak
-    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
+    # Only dark sides of edges: in log intensity they turn sharply, in focus, where bright sides turn far and wide, and
+    # what a lens does to one side of focus and not to the other shows most.
+    believed = (pairs.on > 0) & (curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
     weights = (np.abs(curvature) / gap)[believed]
     middle = pairs.middle[believed]
@@ -387,10 +426,12 @@ def _pair_mode(
     if mode is None:
         unknown = [_lag_of(None, unmeasured_lag / float(one.mean()), calibrated) for one in slownesses]
         return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
-    near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
-    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
-    typical = [float(np.average(one, weights=near)) for one in slow]
-    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past) for one in slow]
+    turns = Turns(middle, pairs.after[believed], weights, mode.at, PAIRS_KERNEL * past)
+    drawn = [turns.line(one[pairs.y, pairs.x][believed]) for one in slownesses]
+    lines = [line for line, _ in drawn]
+    typical = [float(np.average(slow, weights=turns.near)) for _, slow in drawn]
+    # A lag that differs from pixel to pixel spreads their midpoints, which is not to go astray.
+    mode = replace(mode, share=max(mode.share, *(turns.share(line, slow) for line, slow in drawn)))
     # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
     doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
     late = [

@@ -54,8 +54,6 @@ class BuiltImage:
     levels: NDArray[np.float32]
     events: int
     """How many they were."""
-    pictured: bool = False
-    """Whether it began as a picture of the scene, and is one of it now; else it is a difference from what it was."""
 
 
 class EventMemory:
@@ -131,18 +129,13 @@ class EventMemory:
         """The image at the last ``advance``, (height, width) of the region and its margin, in thresholds: a view."""
         return self._energy.image
 
-    @property
-    def pictured(self) -> bool:
-        """Whether the image began as a picture of the scene."""
-        return self._start is not None and self._start.pictured
-
     def built(self) -> BuiltImage:
         """Return what all events so far have built, those after the last ``advance`` too."""
         levels = self._energy.image.copy()
         part = slice(self._taken, self._count)
         _, x, y, on = self._columns
         stamp_events(x[part], y[part], on[part], POINT, levels)
-        return BuiltImage(levels, self._forgotten + self._count, self.pictured)
+        return BuiltImage(levels, self._forgotten + self._count)
 
     def _make_room(self, count: int) -> None:
         """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""

@@ -2,8 +2,9 @@
 
 A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
 than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
-told from a hand that shakes. Where signs lie together as those of one moving edge do, the scene moves, and its image
-is gone on with when the sweep begins.
+told from a hand that shakes. Where signs lie together as those of one moving edge do, the scene moves: then its image
+is gone on with when the sweep begins, on a picture that is laid where the scene is now, and what motion alone does to
+the image's sharpness is measured.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from elpd.vision.alignment import displacement_px, moved
+from elpd.vision.bearing import Unrest
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
 from elpd.vision.flicker import find_flicker, residue
@@ -21,7 +24,7 @@ from elpd.vision.track import frame_levels
 from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -50,6 +53,9 @@ alarm costs a second pass."""
 ORDER_PX = 2.4
 """Scale at which events of one moving edge agree, in a picture that is out of focus."""
 
+STILL_US = 1_000
+"""Between two looks at the image of a resting lens: a tick of a sweep takes about as long."""
+
 
 class Resting:
     """Remembers the events of a region and its margin while nothing is meant to move.
@@ -58,9 +64,13 @@ class Resting:
     ----------
     roi, geometry:
         The region and the sensor.
+    picture:
+        Makes an earlier picture of the whole sensor, log brightness in contrast thresholds; asked where the scene moves
+        and no frame has come.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry) -> None:
+    def __init__(self, roi: Roi, geometry: Geometry, picture: Callable[[], NDArray[np.float32]] | None = None) -> None:
+        self._picture = picture
         self._geometry = geometry
         self._inside = _box(roi, geometry, 0)
         self.heard = _box(roi, geometry, ROI_MARGIN_PX)
@@ -83,7 +93,11 @@ class Resting:
         self.moves = False
         """Whether the events lie together as those of a moving scene do, known after ``settle``."""
         self.image_at_start: BuiltImage | None = None
-        """Where the scene moves, what it looks like now: a frame and the events since, or the events alone."""
+        """Where the scene moves, what has been built: upon a frame, or by the events alone."""
+        self.beneath: NDArray[np.float32] | None = None
+        """What that image lacks of being a picture of the scene, where it began as nothing."""
+        self.unrest: Unrest | None = None
+        """What motion alone does to the sharpness of the two together; ``None`` where there is no picture."""
 
     def add(
         self,
@@ -166,12 +180,29 @@ class Resting:
         self.moves = order(levels) > SIGMAS_OF_MOTION
         if not self.moves:
             return
-        if self._frame is None:
+        before = None
+        if self._frame is not None:
+            since = t_us >= self._frame.t_us
+            now = self._cut(frame_levels(self._frame.pixels)) + self._levels(pixel[since], on[since])
+            before = now - levels
+            self.image_at_start = BuiltImage(now, int(since.sum()))
+        else:
             self.image_at_start = BuiltImage(levels, t_us.size)
-            return
-        since = t_us >= self._frame.t_us
-        levels = self._levels(pixel[since], on[since]) + self._cut(frame_levels(self._frame.pixels))
-        self.image_at_start = BuiltImage(levels, int(since.sum()), pictured=True)
+            if self._picture is not None:  # in the middle of the rest it lies where events are best explained
+                picture = self._cut(self._picture())
+                before = self.beneath = moved(picture, *displacement_px(picture, levels)) - np.float32(0.5) * levels
+        if before is not None:
+            self.unrest = Unrest.of(self._stills(before, t_us, pixel, on), ROI_MARGIN_PX)
+
+    def _stills(
+        self, before: NDArray[np.float32], t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8]
+    ) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield what the scene looked like while nothing else moved: upon the image *before* it, step by step."""
+        image, begin = before, 0
+        for until_us in range((self._begin_us or 0) + STILL_US, self._end_us + 1, STILL_US):
+            end = int(np.searchsorted(t_us, until_us, side="left"))
+            image, begin = image + self._levels(pixel[begin:end], on[begin:end]), end
+            yield until_us, image
 
     def _levels(self, pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the image that events build, of the region and its margin, in thresholds."""
