@@ -131,6 +131,8 @@ def test_cameras_without_frames_are_told_what_they_know(model: str, abilities: t
     assert ("DetectorRunning" in camera.said) == ("trigger" in abilities)
     with pytest.raises(ConfigError, match=r"camera\.biases: this camera's biases cannot be set one by one"):
         source(getattr(dv.io.camera, model), biases={"focus": {"On": (1, 2)}})
+    opened.close()
+    opened.close()
 
 
 def test_an_unplugged_camera_is_an_error() -> None:

@@ -163,7 +163,7 @@ class DavisSource:
 
     def close(self) -> None:
         """Stop the streams; the library closes the camera when it is forgotten. Idempotent."""
-        if self._camera is not None and self._camera.isRunning():
+        if hasattr(self._camera, "setEventsRunning") and self._camera.isRunning():
             self._camera.setEventsRunning(False)
         self._camera = None
 
