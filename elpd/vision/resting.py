@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elpd.vision.alignment import displacement_px, moved
+from elpd.vision.alignment import laid_on
 from elpd.vision.bearing import Unrest
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
@@ -195,7 +195,7 @@ class Resting:
             built, before = BuiltImage(now, int(since.sum())), now - levels
         elif self._picture is not None:  # in the middle of the rest it lies where events are best explained
             picture = self._cut(self._picture())
-            before = self.beneath = moved(picture, *displacement_px(picture, levels)) - np.float32(0.5) * levels
+            before = self.beneath = laid_on(picture, levels) - np.float32(0.5) * levels
         if before is not None:
             self.unrest = Unrest.of(self._stills(before, t_us, pixel, on), ROI_MARGIN_PX)
         if self.moves:
