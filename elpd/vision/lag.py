@@ -49,10 +49,6 @@ _FAR, _CELLS = 6.0, 401
 CLASSES = 10
 FEWEST_CLASSES = 5
 FEWEST_IN_CLASS = 10
-OPTICS = 0.06
-"""What optics alone make classes differ, in kernels of the pairs' mode: edges of more contrast turn nearer to focus,
-and behind a real lens the blur before it is another than behind it. It is smooth in brightness, so no scatter shows it.
-A traced F/2 lens without any lag: midpoints of dark pixels are up to a micrometre earlier than those of bright ones."""
 
 NEIGHBOURS = 2.0
 """Classes next to each other share parts of the scene: so many count as one."""
@@ -114,10 +110,12 @@ def line_of_classes(
     slowness: NDArray[np.float64],
     mode: float,
     width: float,
+    smooth: float = 0.0,
 ) -> Line | None:
     """Return the line of pairs' midpoints against slowness; ``None`` if there is none.
 
-    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say.
+    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say. *smooth*
+    is the standard deviation of what changes with brightness as smoothly as lag and is none: no scatter shows it.
     """
     order = np.argsort(slowness, kind="stable")
     order = order[np.abs(middle[order] - mode) <= 3.0 * width]
@@ -135,9 +133,9 @@ def line_of_classes(
     x, y = np.array(slow) - np.mean(slow), np.array(late) - np.mean(late)
     slope = float(x @ y / (x @ x))
     variance = float(np.square(y - slope * x).sum()) / (x.size - 2)
-    chance = NEIGHBOURS * variance / float(x @ x)
-    optics = (OPTICS * width) ** 2 / float(x @ x / x.size)
-    return Line(slope, sqrt(max(chance + optics, 1e-24)), sqrt(variance), x.size)
+
+    scattered = max(NEIGHBOURS * variance / float(x @ x), 1e-24)
+    return Line(slope, sqrt(scattered + smooth**2 / float(np.mean(x * x))), sqrt(variance), x.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +147,8 @@ class Turns:
     weights: NDArray[np.float64]
     mode: float
     width: float
+    smooth: float = 0.0
+    """As of ``line_of_classes``."""
 
     @property
     def near(self) -> NDArray[np.float64]:
@@ -164,14 +164,14 @@ class Turns:
         it is drawn again. It is believed if the classes then lie closer to it; what something else scatters does not.
         """
         near = self.near
-        plain = line = line_of_classes(self.middle, self.weights, slowness, self.mode, self.width)
+        plain = line = line_of_classes(self.middle, self.weights, slowness, self.mode, self.width, self.smooth)
         late = slowness
         for _ in range(ROUNDS):
             if line is None or line.slope <= 0.0:
                 break
             focus = self.mode - line.slope * float(np.average(late, weights=near))
             late = -slowness * np.expm1(-np.maximum(self.after - focus, 0.0) / (line.slope * slowness))
-            line = line_of_classes(self.middle, self.weights, late, self.mode, self.width)
+            line = line_of_classes(self.middle, self.weights, late, self.mode, self.width, self.smooth)
         if plain is None or line is None or line.scatter > plain.scatter:
             return plain, slowness
         return line, late

@@ -1,5 +1,6 @@
 """The rebuilt image against its twin, the vertex, and how witnesses are fused."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -201,6 +202,22 @@ def test_a_line_that_bending_makes_no_better_stays_straight() -> None:
     assert line is not None
     assert effective == pytest.approx(slowness, rel=1e-6)
     assert turns.share(None, effective) == 0.0
+
+
+def test_what_is_smooth_in_brightness_and_no_lag_is_in_the_error_of_the_line() -> None:
+    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
+    bare = line_of_classes(middle, weights, slowness, mode, width)
+    doubted = line_of_classes(middle, weights, slowness, mode, width, smooth=0.6)
+    assert bare is not None
+    assert doubted is not None
+    assert doubted.slope == bare.slope
+    assert doubted.sigma > 3.0 * bare.sigma
+    # A picture of wider brightness tells the two apart better.
+    wide = line_of_classes(middle, weights, 4.0 * slowness, mode, width, smooth=0.6)
+    assert wide is not None
+    assert wide.sigma == pytest.approx(doubted.sigma / 4.0)
+    # Nothing else is left to say than what is known of photoreceptors.
+    assert expected_lag(replace(bare, sigma=1e3), 1.0).at == pytest.approx(expected_lag(None, 1.0).at, rel=0.01)
 
 
 def test_a_lag_is_never_negative_and_unmeasured_is_what_may_be_expected() -> None:
