@@ -302,6 +302,17 @@ def test_what_the_usb_loses_is_a_gap_and_counted(rig: Rig) -> None:
             gaps += packet is not None and packet.gap_before
 
 
+def test_a_camera_that_another_program_holds_says_so(rig: Rig) -> None:
+    rig.lost = True
+    rig.camera.close()
+    rig.bus.claimed.set()
+    try:
+        with pytest.raises(CameraError, match=r"another program holds it; close that one first, `elpd check` names it"):
+            neuromorphic.open_camera(SETTINGS, MonotonicClock())
+    finally:
+        rig.bus.claimed.clear()
+
+
 def test_unplugged_and_plugged_in_again(started: Rig) -> None:
     """What comes back has its chip mounted another way round; pictures stand as they stood."""
     camera = started.camera

@@ -195,6 +195,7 @@ def test_serial_ports_are_looked_for_without_being_opened(tmp_path: Path, monkey
         ("Access denied (insufficient permissions)", "prints the udev rule"),
         ("Failed to open USB device. This usually happens due to permissions or driver issues", "udev rule"),
         ("Resource busy", "another program holds it"),
+        ("the device is already used by another program", "another program holds it"),
         ("PropheseeEvk4(Usb(Rusb(NoDevice)))", "unplugged (no device)"),
         ("no device found", "none found"),
         ("PropheseeEvk4(Usb(Rusb(Pipe)))", "stalled"),

@@ -22,7 +22,10 @@ _MEANINGS = (
         ("access", "permission", "insufficient"),
         "no permission to open it; `elpd check` prints the udev rule that gives it, then plug it in again",
     ),
-    (("busy", "already open", "in use"), "another program holds it; close that one first, `elpd check` names it"),
+    (
+        ("busy", "already open", "already used", "in use"),
+        "another program holds it; close that one first, `elpd check` names it",
+    ),
     (
         ("nodevice", "no such device", "disconnected", "not connected"),
         "it was unplugged (no device); plug it in again",
