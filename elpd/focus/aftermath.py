@@ -180,6 +180,10 @@ class Aftermath:
         self._passes.add(said, course.leg.sign, (course.decided_us - look_back_us, course.decided_us))
         return self._passes.estimate(settings.play)
 
+    def take_for_moving(self) -> None:
+        """Take the scene for one that moves: what has been said of it as still is forgotten."""
+        self._passes.forget()
+
     @property
     def gap_near_crossing(self) -> bool:
         """Whether anything was lost in the last part of a pass, where the estimate comes from."""

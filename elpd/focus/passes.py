@@ -182,6 +182,11 @@ class Passes:
         self.scene_moves |= said.scene_moves
         self.deaf = self.deaf or said.deaf
 
+    def forget(self) -> None:
+        """Forget what witnesses said of a scene that was taken for still; it moves."""
+        self._said = [(Testimony(), sign) for _, sign in self._said]
+        self.scene_moves = True
+
     @property
     def sign(self) -> int:
         """Direction of the sweep; 0 before it is over."""
