@@ -391,6 +391,9 @@ class FocusCycle:
 
     def _result(self, outcome: Outcome, reason: str, final_um: float) -> FocusResult:
         estimate = self._estimate
+        shake_rad_s = self._stage.shake.rms_rad_s
+        if shake_rad_s is not None:
+            self._details["shake_rad_s"] = shake_rad_s
         ends = [at for _, at in self._phases[1:]]
         phases = tuple(
             PhaseTime(phase.value, (end - at) / NS_PER_MS) for (phase, at), end in zip(self._phases, ends, strict=False)

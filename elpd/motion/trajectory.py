@@ -147,6 +147,8 @@ _RELAY_S = 2e-4
 _RELAYS = 4
 MARK_NS = 2_000
 """A mark's edge leaves with the step, and a camera stamps it to the microsecond."""
+_UNLIKELY = 3.0
+"""Standard deviations beyond which a report at rest shows that the model's own are too small."""
 _LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 200_000_000, NS_PER_S
 
 
@@ -227,7 +229,8 @@ class Trajectory:
         when, sigma_s = self._sampled(report)
         epoch = self._epochs[self._index(when)]
         steps, velocity, h_offset, h_delay = epoch.depends(when)
-        variance = self._variance(epoch, velocity, h_offset, h_delay) + self._reading_variance(velocity, sigma_s)
+        reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
+        variance = self._variance(epoch, velocity, h_offset, h_delay) + reading
         return Surprise(report.steps - steps, math.sqrt(variance))
 
     def observe(self, report: LensReport) -> None:
@@ -242,6 +245,10 @@ class Trajectory:
             return
         if epoch.marked and report.moving and report.latest_ns - report.earliest_ns > 2 * MARK_NS:
             return  # its latency, which all reports share, would outvote the marks
+        if not report.moving and self._rests_elsewhere(epoch, report, when):
+            self._epochs.insert(index + 1, _Epoch(when, when, REST, 0.0, epoch.number, (report.steps, 0.0)))
+            self._follow_from(index + 1)
+            return
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
@@ -305,6 +312,16 @@ class Trajectory:
 
     # --- below: how it is done -----------------------------------------------------------------------------------
 
+    def _rests_elsewhere(self, epoch: _Epoch, report: LensReport, when: int) -> bool:
+        """Say whether a motor at rest, by itself and by the model, is not where a model too sure of itself has it.
+
+        At rest the controller's own count is exact, whatever was supposed of the way there.
+        """
+        if state_at(epoch.path, when)[1] != 0.0:
+            return False
+        surprise = self.expect(report)
+        return abs(surprise.steps) > _UNLIKELY * surprise.sigma_steps
+
     def _state(self, when: int) -> tuple[_Epoch, float, float, float, float]:
         if not self._epochs:
             raise LensError("lens: position asked for before the controller reported any; poll it first")
@@ -332,6 +349,13 @@ class Trajectory:
             return report.earliest_ns + width // 2, width / math.sqrt(12) / NS_PER_S
         late = min(self._timing.reply_ns, width // 2)
         return report.earliest_ns + late, min(self._timing.reply_sigma_ns, width / math.sqrt(12)) / NS_PER_S
+
+    def _fastest(self, report: LensReport, velocity: float) -> float:
+        """Return the velocity that a reply's time is uncertain at: a stop may lie inside a wide interval."""
+        if report.latest_ns - report.earliest_ns <= self._timing.prompt_ns + self.held_ns:
+            return velocity
+        ends = (report.earliest_ns, report.latest_ns)
+        return max(velocity, *(state_at(self._epochs[self._index(end)].path, end)[1] for end in ends), key=abs)
 
     def _follow_from(self, index: int) -> None:
         for later in range(max(index, 1), len(self._epochs)):
@@ -394,7 +418,8 @@ class Trajectory:
     def _correct(self, epoch: _Epoch, report: LensReport) -> None:
         when, sigma_s = self._sampled(report)
         steps, velocity, h_offset, h_delay = epoch.depends(when)
-        noise = self._reading_variance(velocity, sigma_s) + self._model_variance(epoch, velocity)
+        reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
+        noise = reading + self._model_variance(epoch, velocity)
         epoch.correct(report.steps - steps, h_offset, h_delay, noise)
 
     def _variance(self, epoch: _Epoch, velocity: float, h_offset: float, h_delay: float) -> float:
@@ -429,4 +454,7 @@ def _velocity_where(epoch: _Epoch, steps: float, until_ns: int) -> float | None:
 
 def _says_nothing_new(epoch: _Epoch, report: LensReport, when: int) -> bool:
     """At rest the same rounded number again is the same rounding error again, not more evidence."""
-    return report.steps == epoch.reports[-1].steps and state_at(epoch.path, when)[1] == 0.0 and not report.moving
+    last = epoch.reports[-1]
+    vaguer = last.latest_ns - last.earliest_ns > 2 * (report.latest_ns - report.earliest_ns)
+    again = report.steps == last.steps and not report.moving and not last.moving and not vaguer
+    return again and state_at(epoch.path, when)[1] == 0.0

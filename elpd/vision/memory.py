@@ -185,8 +185,10 @@ class EventMemory:
         """Return a lamp's flicker, if the events show one."""
         if self._count == 0:
             return None
-        t_us, on = self._t_us, self._columns[3][: self._count]
-        return find_flicker(t_us, on, int(t_us[0]), int(t_us[-1]) + 1)
+        t_us = self._t_us
+        _, x, y, on = (column[: self._count] for column in self._columns)
+        pixel = y.astype(np.int64) * self._shape[1] + x
+        return find_flicker(t_us, pixel, on, int(t_us[0]), int(t_us[-1]) + 1)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
@@ -224,12 +226,15 @@ class EventMemory:
         deaf_us: float = 0.0,
         start: NDArray[np.float32] | None = None,
         dark: float = DARK,
+        *,
+        hurried: bool = True,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
         show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
-        that the sensor saw when it sent the first of them. ``None`` when there is nothing to ask.
+        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
+        ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -260,6 +265,7 @@ class EventMemory:
             self._cut(start),
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
             dark,
+            hurried=hurried,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -275,9 +281,9 @@ class EventMemory:
         brightness: NDArray[np.float32] | None = None,
         start: NDArray[np.float32] | None = None,
     ) -> tuple[list[Witness], float | None]:
-        """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
+        """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start)
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None

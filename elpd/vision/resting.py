@@ -155,7 +155,7 @@ class Resting:
         """Draw the conclusions; return what the region says at rest under *weights*, hot pixels left out."""
         t_us, pixel, on = self._events()
         begin_us = self._begin_us or 0
-        self.flicker = find_flicker(t_us, on, begin_us, self._end_us)
+        self.flicker = find_flicker(t_us, pixel, on, begin_us, self._end_us)
         self.hot = self._hot(pixel, on)
         kept = ~self.hot.ravel()[pixel]
         t_us, pixel, on = t_us[kept], pixel[kept], on[kept]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from random import Random
 
 import pytest
 from elpd_drivers.sim.controllers import CONTROLLERS
@@ -357,6 +358,58 @@ def test_an_adapter_that_keeps_replies_back_makes_positions_vaguer_not_wrong(kin
     made.port.faults.latency_timer_ns = 0
     made.live(1000)
     assert made.lens.remarks == ()
+
+
+def put_aside_beside_the_port(made: Rig, side: str, seed: int) -> None:
+    """Let 20 to 400 ms pass, one time in ten, "before" or "after" each "read" or "write"."""
+    draw, awake_until = Random(seed), made.soon(0)
+    when, what = side.split()
+    port_does = made.port.read_available if what == "read" else made.port.write
+
+    def put_aside() -> None:
+        nonlocal awake_until
+        if draw.random() < 0.1 and made.clock.now_ns() >= awake_until:
+            made.clock.pass_ms(draw.uniform(20, 400))
+            awake_until = made.soon(20)
+
+    def beside(*data: bytes) -> bytes | None:
+        if when == "before":
+            put_aside()
+        done = port_does(*data)
+        if when == "after":
+            put_aside()
+        return done
+
+    setattr(made.port, "read_available" if what == "read" else "write", beside)
+
+
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
+@pytest.mark.parametrize("side", ["before read", "after read", "before write", "after write"])
+@pytest.mark.parametrize("seed", [1, 2, 15])
+def test_a_thread_that_is_put_aside_beside_the_port_loses_no_position(kind: str, side: str, seed: int) -> None:
+    """On a busy machine the scheduler takes hundreds of milliseconds between two lines of any program."""
+    made = open_rig(kind)
+    made.live(20)
+    put_aside_beside_the_port(made, side, seed)
+    for velocity in (SPEED_SPS / 8, -SPEED_SPS / 8, SPEED_SPS / 8):
+        made.lens.run(velocity, made.soon(1500))
+        made.live(600)
+    made.lens.stop(StopMode.RAMPED)
+    made.live(1000)
+    assert not made.moving
+    estimate = made.lens.position_at(made.clock.now_ns())
+    assert estimate.sigma_steps < 1.5
+    assert estimate.steps == pytest.approx(made.rotor, abs=4 * estimate.sigma_steps)
+
+
+@pytest.mark.parametrize("side", ["before read", "after read", "before write", "after write"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_thread_that_is_put_aside_beside_the_port_homes_all_the_same(kind: str, side: str, seed: int) -> None:
+    made = open_rig(kind)
+    put_aside_beside_the_port(made, side, seed)
+    report = made.lens.home(made.soon(60_000))
+    assert LensFlag.REFERENCED in report.flags
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=3.2)
 
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")

@@ -211,7 +211,7 @@ class AvrController:
             sequence = self._next()
             self._line.send(wire.encode(sequence, command, payload))
             due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
-            while self._clock.now_ns() < due:
+            while self._line.looked_ns < due:
                 for reply in self._frames.feed(self._line.read()):
                     if reply.sequence == sequence and reply.command == command:
                         return reply
@@ -310,9 +310,8 @@ class AvrController:
 
     # --- questions and replies -------------------------------------------------------------------------------------
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Ask for a report; send again what was not confirmed."""
-        del now_ns
         pending = self._unconfirmed
         if pending is not None:
             sequence, frame, stops, tries = pending
@@ -325,7 +324,7 @@ class AvrController:
         self._asked = self._next()
         self._sampled_from_ns = self._line.send(wire.encode(self._asked, wire.STATUS)).off_wire_ns
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take what has come; the reply to the newest question is a reading, all others are acted on."""
         reading = None
         for reply in self._frames.feed(self._line.read()):
@@ -339,10 +338,10 @@ class AvrController:
             self._watch_restart(reply)
             self._flags = reply.flags
             self._watch_iris(reply.flags)
-            reading = self._reading(reply, now_ns)
+            reading = self._reading(reply)
         return reading
 
-    def _reading(self, reply: wire.Reply, now_ns: int) -> Reading:
+    def _reading(self, reply: wire.Reply) -> Reading:
         velocity, steps = float(reply.velocity_sps), float(reply.position)
         if velocity:
             # a rotor moves to a step after its pulse: so much of the way is still to go
@@ -350,7 +349,7 @@ class AvrController:
             steps -= math.copysign(max(0.0, 1.0 - way), velocity)
         at_switch = bool(reply.flags & (wire.AT_MIN | wire.AT_MAX))
         reply_ns = len(wire.encode(0, wire.STATUS, bytes(19))) * self._line.byte_ns
-        latest = max(now_ns - reply_ns, self._sampled_from_ns)
+        latest = max(self._line.by_ns - reply_ns, self._sampled_from_ns)
         return Reading(
             steps,
             velocity,

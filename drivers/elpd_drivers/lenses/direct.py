@@ -105,11 +105,11 @@ class Controller(Protocol):
         """Identify, halt what moves, set up. Raises ``LensError`` for what is not this controller."""
         ...
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Send the question for the next reading."""
         ...
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take what has come; return a reading when one is complete."""
         ...
 
@@ -355,14 +355,14 @@ class DirectLens:
             return CommandStamp(name, going.begun_ns, going.done_ns)
 
     def _poll(self, *, fuse: bool) -> LensReport | None:
-        now = self._clock.now_ns()
         asking = self._controller.asking
-        reading = self._controller.read(now)
+        reading = self._controller.read()
         report = None if reading is None else self._take(reading, fuse=fuse)
-        asking.check(now, " and the controller's settings")
-        if self._due(now):
-            self._controller.ask(self._clock.now_ns())
-            asking.asked(now)
+        looked = self._line.looked_ns
+        asking.check(looked, " and the controller's settings")
+        if self._due(looked):
+            self._controller.ask()
+            asking.asked(self._clock.now_ns())  # before that nobody can have missed an answer
         return report
 
     def _due(self, now: int) -> bool:

@@ -87,7 +87,7 @@ class GrblLens:
         self._lines = LineReader()
         self._asking = Asking(settings.query_ms, settings.reply_ms, lost_share=1 / 3)
         self._sampled_from_ns = 0
-        self._read_ns = self._line_begun_ns = self._line_end_ns = 0
+        self._line_begun_ns = self._line_end_ns = 0
         self._unacknowledged: deque[int | None] = deque()
         self._status: Status | None = None
         self._wish: _Wish | None = None
@@ -337,23 +337,23 @@ class GrblLens:
 
     def _poll(self, *, fuse: bool) -> LensReport | None:
         report = self._take_lines(fuse=fuse)
-        now = self._clock.now_ns()
+        now = self._line.looked_ns
         if self._resetting:
             if now >= self._restarted_by_ns:
                 raise Trouble(f"no banner within {RESTART_MS:.0f} ms of a reset; check the cable and the supply")
             return report
         self._asking.check(now, "")
         if self._asking.due(now):
-            self._sampled_from_ns = self._line.send(STATUS).off_wire_ns
-            self._asking.asked(now)
+            sent = self._line.send(STATUS)
+            self._sampled_from_ns = sent.off_wire_ns
+            self._asking.asked(sent.done_ns)
         return report
 
     def _take_lines(self, *, fuse: bool) -> LensReport | None:
         """Read and act on every complete line; return the newest report."""
         data = self._line.read()
-        before, now = self._read_ns, self._clock.now_ns()
-        self._read_ns = now
-        newest = None
+        before, now = self._line.since_ns, self._line.by_ns
+        newest, newest_begun = None, None
         for line, bytes_after in self._lines.feed(data):
             # when the line's first byte can have left the board, at the latest
             length_ns = (len(line) + 2) * self._line.byte_ns
@@ -363,13 +363,15 @@ class GrblLens:
                 newest = (self._take_status(status, begun, fuse=fuse) if status else None) or newest
             elif line == "ok":
                 # not before the last look at the port, unless it had to wait behind the line before it
-                earliest = before - length_ns
-                if earliest < self._line_end_ns:
-                    earliest = self._line_begun_ns
-                self._acknowledged(earliest, begun)
+                waited = before - length_ns < self._line_end_ns
+                self._acknowledged(self._line_begun_ns if waited else before - length_ns, begun)
             else:
                 self._heed(line)
-            self._line_begun_ns, self._line_end_ns = begun, begun + length_ns
+            self._line_begun_ns = min(before - length_ns, begun)  # for what comes with it: nobody looked in between
+            self._line_end_ns = begun + length_ns
+            newest_begun = begun
+        if newest_begun is not None:
+            self._line_begun_ns = newest_begun
         return newest
 
     def _acknowledged(self, earliest: int, latest: int) -> None:

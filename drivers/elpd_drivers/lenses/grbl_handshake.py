@@ -160,12 +160,11 @@ class _Handshake:
                     answers.append(got)
                 elif got.startswith("error:"):
                     raise LensError(f"lens port {self._line.name}: GRBL answers {line} with {got}; is it GRBL 1.1?")
-            now = self._clock.now_ns()
-            if now >= due:
+            if self._line.looked_ns >= due:
                 raise LensError(
                     f"lens port {self._line.name}: no answer to {line} within {patience_ms:.0f} ms; check the cable"
                 )
-            self._clock.sleep_until(after_ms(now, 1))
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 1))
 
     def _numbers(self, lines: list[str]) -> dict[int, float]:
         """Read what ``$$`` printed; other firmware adds comments and settings that are no numbers."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from elpd.errors import LensError
-from elpd.units import NS_PER_S
+from elpd.units import NS_PER_S, HostNs
 from elpd_drivers.lenses.axis import ADAPTER_LATENCY_SIGMA_US, ADAPTER_LATENCY_US, read_settings
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from elpd.ports import BytePort, Clock
-    from elpd.units import HostNs
 
 
 class Trouble(Exception):  # noqa: N818  (not an error yet: the words of one, for whoever can stop the motor)
@@ -56,6 +55,10 @@ class Line:
         self.name = name or "(in memory)"
         self.byte_ns = 10 * NS_PER_S // baud
         self._port, self._clock = port, clock
+        self.since_ns = self.by_ns = HostNs(0)
+        """Between which instants came what ``read`` returned last: the look before it, and its own end."""
+        self.looked_ns = HostNs(0)
+        """When ``read`` last looked: what is not in it by then had not come. Patience is measured with this."""
         self._fault: str | None = None
         self._free_ns = 0
         self._lock = threading.Lock()
@@ -74,12 +77,20 @@ class Line:
             return Sent(begun, done, self._free_ns)
 
     def read(self) -> bytes:
-        """Return what has come."""
+        """Return what has come, and note between which instants.
+
+        A thread can be put aside between a look at the port and a look at the clock, for as long as a busy machine
+        likes. So the clock is read on both sides of the port: before it for what the next look will find, after it for
+        what this one did.
+        """
+        looked = self._clock.now_ns()
         try:
-            return self._port.read_available()
+            data = self._port.read_available()
         except LensError as error:
             self._latch(str(error))
             raise
+        self.since_ns, self.by_ns, self.looked_ns = self.looked_ns, self._clock.now_ns(), looked
+        return data
 
     def close(self) -> None:
         """Give the port back. Idempotent."""

@@ -201,12 +201,11 @@ class Scf4Controller:
                 seen = line
                 if (value := reads(line)) is not None:
                     return value
-            now = self._clock.now_ns()
-            if now >= due:
+            if self._line.looked_ns >= due:
                 raise Trouble(
                     f"no reply to {what} for {self._settings.reply_ms:.0f} ms (saw {seen[:60]!r}); check the cable"
                 )
-            self._clock.sleep_until(after_ms(now, 0.5))
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
@@ -294,12 +293,11 @@ class Scf4Controller:
 
     # --- queries and replies ---------------------------------------------------------------------------------------
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Ask for everything there is."""
-        del now_ns
         self._asked_off_ns = self._line.send(wire.STATUS).off_wire_ns
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take the lines that have come; a status that nobody waits for is late, or a duplicate."""
         reading = None
         for line, behind in self._lines.feed(self._line.read()):
@@ -309,7 +307,7 @@ class Scf4Controller:
             if status is None or not self.asking.open:
                 continue
             self.asking.answered()
-            latest_ns = max(now_ns - (len(line) + 2 + behind) * self._line.byte_ns, self._asked_off_ns)
+            latest_ns = max(self._line.by_ns - (len(line) + 2 + behind) * self._line.byte_ns, self._asked_off_ns)
             near = status.count if self._count is None else self._count
             count = wire.unwrapped(status.count, near)
             reading = Reading(

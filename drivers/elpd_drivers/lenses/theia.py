@@ -100,7 +100,7 @@ class TheiaLens:
         self._motor = Motor(Timing(self._latency_ns, self._sigma_ns, self._sigma_ns // 2, 2.0, ramp_steps=1.0))
         self._asking = Asking(settings.query_ms, settings.reply_ms)
         self._replies = wire.ReplyReader()
-        self._read_ns = self._asked_ns = 0
+        self._asked_ns = 0
         self._going: _Going | None = None
         ruler = {"motor": settings.motor, "switch": settings.switch, "um_per_step": settings.um_per_step}
         self._remembered = Remembered(settings.position_file, ruler)
@@ -293,10 +293,10 @@ class TheiaLens:
     # --- replies ---------------------------------------------------------------------------------------------------
 
     def _poll(self) -> LensReport | None:
-        before, now = self._read_ns, self._clock.now_ns()
-        self._read_ns = now
+        data = self._line.read()
+        before, now = self._line.since_ns, self._line.by_ns
         newest: LensReport | None = None
-        for reply in self._replies.feed(self._line.read()):
+        for reply in self._replies.feed(data):
             if reply[0] == wire.DONE and self._going is not None:
                 latest_ns = max(now - len(reply) * self._line.byte_ns, self._going.begun_ns)
                 newest = self._over(self._going, reply, max(before, self._going.begun_ns), latest_ns)
@@ -307,10 +307,12 @@ class TheiaLens:
         if self._going is not None:
             self._asking.forget()  # it would not be read
             return newest
-        self._asking.check(now, "")
-        if self._asking.due(now):
-            self._asked_ns = self._line.send(wire.version()).off_wire_ns
-            self._asking.asked(now)
+        looked = self._line.looked_ns
+        self._asking.check(looked, "")
+        if self._asking.due(looked):
+            sent = self._line.send(wire.version())
+            self._asked_ns = sent.off_wire_ns
+            self._asking.asked(sent.done_ns)
         return newest
 
     def _over(self, going: _Going, reply: bytes, earliest_ns: int, latest_ns: int) -> LensReport:

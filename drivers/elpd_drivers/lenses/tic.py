@@ -181,16 +181,15 @@ class TicController:
         expected = length + self._settings.crc_responses
         while True:
             self._received += self._line.read()
-            now = self._clock.now_ns()
             if len(self._received) >= expected:
                 break
-            if now >= due:
+            if self._line.looked_ns >= due:
                 raise LensError(
                     f"lens port {self._line.name}: no answer from a Tic within "
                     f"{self._settings.reply_ms:.0f} ms (received {bytes(self._received)!r}); check power, cable, baud "
                     f"({self._settings.baud}), device number and CRC settings"
                 )
-            self._clock.sleep_until(after_ms(now, 0.5))
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
         raw = bytes(self._received)
         self._received.clear()
         if len(raw) != expected or (self._settings.crc_responses and crc7(raw[:length]) != raw[length]):
@@ -260,14 +259,13 @@ class TicController:
 
     # --- queries and replies ---------------------------------------------------------------------------------------
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Ask for position, velocity, flags and errors, and keep the command timeout from running out."""
-        del now_ns
         self._received.clear()
         end = self._line.send(self._query_bytes).off_wire_ns
         self._sampled_from_ns = end - (len(self._query_bytes) - self._query_head) * self._line.byte_ns
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take the reply when all of it has come; without CRC only what cannot be is refused."""
         self._received += self._line.read()
         if not self.asking.open or len(self._received) < self._reply_length:
@@ -283,7 +281,7 @@ class TicController:
         at_switch = bool(reply.flags & (wire.FORWARD_LIMIT | wire.REVERSE_LIMIT))
         # a moving motor is half a step beyond the last one that it made, on average
         steps = reply.position + (0.5 if velocity > 0 else -0.5 if velocity < 0 else 0.0)
-        latest = now_ns - self._reply_length * self._line.byte_ns
+        latest = self._line.by_ns - self._reply_length * self._line.byte_ns
         return Reading(
             steps,
             velocity,

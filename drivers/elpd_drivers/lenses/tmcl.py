@@ -155,11 +155,10 @@ class TmclController:
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms / 4)
         self._round.clear()
         while self._waiting is not None or self._talk.stops_open > 0:
-            self._take(self._clock.now_ns())
-            now = self._clock.now_ns()
-            if now >= due:
+            self._take()
+            if self._line.looked_ns >= due:
                 break
-            self._clock.sleep_until(after_ms(now, LOOK_MS))
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), LOOK_MS))
         self._waiting, self._talk.stops_open = None, 0
         self.asking.answered()
 
@@ -211,9 +210,9 @@ class TmclController:
         reply_out_ns = self._asked_off_ns + self._latency.usual_ns + wire.FRAME * self._line.byte_ns
         return max(0, reply_out_ns - sent.off_wire_ns)
 
-    def _repeat_stop(self, now_ns: int) -> None:
+    def _repeat_stop(self) -> None:
         """Send an unacknowledged stop again, when its reply and the one before it should have come."""
-        if self._talk.stops_open > 0 and now_ns - self._stop_sent_ns > 2 * self._exchange_ns:
+        if self._talk.stops_open > 0 and self._line.looked_ns - self._stop_sent_ns > 2 * self._exchange_ns:
             sent = self._line.send(self.stop_bytes[StopMode.RAMPED])
             self._talk.stops_open, self._stop_sent_ns = 1, sent.off_wire_ns
             # it may have been any of them
@@ -272,9 +271,8 @@ class TmclController:
 
     # --- queries and replies ---------------------------------------------------------------------------------------
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Begin a round of questions: speed, then position, and one more that is due now and then."""
-        del now_ns
         self._waiting = None
         self._round.clear()
         if self.stop_bytes is self._aborting:
@@ -284,20 +282,20 @@ class TmclController:
         self._rounds += 1
         self._go_on()
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take what has come, and send the round's next question, or again a stop that nobody heard."""
-        self._take(now_ns)
-        self._repeat_stop(now_ns)
+        self._take()
+        self._repeat_stop()
         if self.asking.open:
             self._go_on()
         return self._ready.popleft() if self._ready else None
 
-    def _take(self, now_ns: int) -> None:
+    def _take(self) -> None:
         for reply, behind in self._talk.replies():
             if self._waiting is None or reply.command != self._waiting.command:
                 self._talk.heed(reply)  # or late, or a duplicate: its instant of sampling is unknown
                 continue
-            ended_ns = now_ns - behind * self._line.byte_ns
+            ended_ns = self._line.by_ns - behind * self._line.byte_ns
             if ended_ns < self._asked_off_ns + wire.FRAME * self._line.byte_ns:
                 continue  # so soon it cannot be the answer: replies do not say which parameter they are of
             question, self._waiting = self._waiting, None

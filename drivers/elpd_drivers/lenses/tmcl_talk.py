@@ -108,13 +108,12 @@ class Talk:
                 if reply.command == command:
                     return reply
                 self.heed(reply)
-            now = self.clock.now_ns()
-            if now >= due:
+            if self.line.looked_ns >= due:
                 raise Trouble(
                     f"no reply to command {command} for {self.settings.reply_ms:.0f} ms; check the cable, or raise "
                     "lens.reply_ms"
                 )
-            self.clock.sleep_until(after_ms(now, LOOK_MS))
+            self.clock.sleep_until(after_ms(self.clock.now_ns(), LOOK_MS))
 
 
 def refusal(reply: wire.Reply, next_step: str) -> Trouble:
@@ -132,7 +131,7 @@ def identify(talk: Talk) -> None:
         line.send(talk.frame(wire.GET_VERSION))
         due, seen = after_ms(clock.now_ns(), settings.reply_ms), b""
         firmware = None
-        while firmware is None and clock.now_ns() < due:
+        while firmware is None and line.looked_ns < due:
             seen += line.read()
             firmware = wire.parse_version(seen, settings.host)
             clock.sleep_until(after_ms(clock.now_ns(), LOOK_MS))

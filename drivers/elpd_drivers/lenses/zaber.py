@@ -229,12 +229,11 @@ class ZaberController:
                 if reply is not None and reply.number == number:
                     self._refuse_rejection(reply)
                     return reply
-            now = self._clock.now_ns()
-            if now >= due:
+            if self._line.looked_ns >= due:
                 raise Trouble(
                     f"no reply to {words!r} for {self._settings.reply_ms:.0f} ms (saw {seen[:60]!r}); check the cable"
                 )
-            self._clock.sleep_until(after_ms(now, 0.5))
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
 
     def _ours(self, line: str) -> wire.Reply | None:
         """Read a line that is this axis's; once a reply had a checksum, all must."""
@@ -310,13 +309,12 @@ class ZaberController:
 
     # --- queries and replies ---------------------------------------------------------------------------------------
 
-    def ask(self, now_ns: int) -> None:
+    def ask(self) -> None:
         """Ask for the position; whether it moves and what is wrong comes with every reply."""
-        del now_ns
         self._question = self._next_number()
         self._asked_off_ns = self._line.send(self._frame("get pos", self._question)).off_wire_ns
 
-    def read(self, now_ns: int) -> Reading | None:
+    def read(self) -> Reading | None:
         """Take the lines that have come; a reply with another number is late, a duplicate, or an order's."""
         reading = None
         for line, behind in self._lines.feed(self._line.read()):
@@ -325,7 +323,7 @@ class ZaberController:
                 continue
             self._refuse_faults(reply.flag)
             if reply.number is not None and reply.number == self._question:
-                latest_ns = now_ns - (len(line) + 2 + behind) * self._line.byte_ns
+                latest_ns = self._line.by_ns - (len(line) + 2 + behind) * self._line.byte_ns
                 reading = self._position(reply, latest_ns) or reading
             elif reply.number in self._orders:
                 self._orders.discard(reply.number)
