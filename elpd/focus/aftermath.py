@@ -195,6 +195,15 @@ class Aftermath:
         return self._passes.estimate(settings.play)
 
     @property
+    def both_ways(self) -> bool:
+        """Whether passes in both directions have found focus: a lens that does not move finds none."""
+        return self._passes.both_ways
+
+    def take_for_moving(self) -> None:
+        """Take the scene for one that moves: what has been said of it as still is forgotten."""
+        self._passes.forget()
+
+    @property
     def gap_near_crossing(self) -> bool:
         """Whether anything was lost in the last part of a pass, where the estimate comes from."""
         return self._passes.hold_any(self._hearing.gaps_us)

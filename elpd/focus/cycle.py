@@ -189,7 +189,7 @@ class FocusCycle:
         ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
         first, furthest_um = watch.after.estimate(), ended.um
-        if recross.is_needed(watch):
+        if recross.is_needed(watch, first, self._settings):
             first, furthest_um = self._pass_again(watch, first, sign)
             way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
         estimate = self._judge(watch, first, sign, (passed.begun_um, furthest_um))

@@ -134,6 +134,11 @@ class Watch:
         return self.resting.moves if self._after is None else self._after.scene_moves
 
     @property
+    def motion_suspected(self) -> bool:
+        """Whether the resting sensor said more than noise does, too little for certainty."""
+        return self.resting.unrest is not None
+
+    @property
     def resting_rate_hz(self) -> float:
         """Events per second that noise makes in the region: what it sends at rest, unless the scene moved."""
         return 0.0 if self.scene_moves else 1e6 * self._hearing.rest_rate.events_per_us
