@@ -222,6 +222,15 @@ class Temperature(Protocol):
 
 
 @runtime_checkable
+class Inertial(Protocol):
+    """A camera with an inertial sensor, whose samples come in its packets, stamped with the camera's own clock."""
+
+    def enable_imu(self, *, on: bool) -> None:
+        """Deliver its samples, or do not."""
+        ...
+
+
+@runtime_checkable
 class Counters(Protocol):
     """A camera that counts what it delivered and what was lost on the way."""
 
@@ -459,13 +468,14 @@ class WriterTraits:
     """What a file being written can hold.
 
     ``encoding`` names the raw words that are taken as they are, beside arrays, ``None`` where there are none;
-    ``triggers`` and ``frames`` say what else is kept. ``first_limit_us`` is the largest time that the first event may
-    have (``None``: any).
+    ``triggers``, ``frames`` and ``imu`` say what else is kept. ``first_limit_us`` is the largest time that the first
+    event may have (``None``: any).
     """
 
     encoding: Encoding | None = None
     triggers: bool = False
     frames: bool = False
+    imu: bool = False
     first_limit_us: int | None = None
 
 
@@ -483,7 +493,7 @@ class RecordingWriter(Protocol):
         ...
 
     def write(self, packet: CameraPacket) -> None:
-        """Append a packet: an array of events, or words of ``traits.encoding``, with its triggers and frames.
+        """Append a packet: an array of events, or words of ``traits.encoding``, and what came with them.
 
         Raises ``FormatError`` for what the format cannot say, ``OSError`` when there is no room; what was written
         before stays whole, and ``close`` may follow.

@@ -8,11 +8,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from elpd_drivers.inertia import acceleration_m_s2, rotation_rad_s
 from hypothesis import strategies as st
 
 from elpd.events.layout import packed
 from elpd.events.stream import EventStream, open_recording
-from elpd.records import CameraPacket, Encoding, Frame, Geometry, Trigger
+from elpd.records import CameraPacket, Encoding, Frame, Geometry, ImuSample, Trigger
 from elpd.units import HostNs, SensorUs
 
 if TYPE_CHECKING:
@@ -40,11 +41,19 @@ def event_columns(longest: int = 60, *, largest_step_us: int = 300) -> Any:
     return st.lists(one, max_size=longest).map(columns)
 
 
-def packet(columns: Sequence[Any], *, triggers: Sequence[Trigger] = (), frames: Sequence[Frame] = ()) -> CameraPacket:
+def packet(
+    columns: Sequence[Any],
+    *,
+    triggers: Sequence[Trigger] = (),
+    frames: Sequence[Frame] = (),
+    imu: Sequence[ImuSample] = (),
+) -> CameraPacket:
     """Return columns as a packet."""
     dtypes = (np.int64, np.uint16, np.uint16, np.uint8)
     arrays = [np.asarray(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)]
-    return CameraPacket(packed(*arrays), Encoding.ARRAY, HostNs(0), triggers=tuple(triggers), frames=tuple(frames))
+    return CameraPacket(
+        packed(*arrays), Encoding.ARRAY, HostNs(0), triggers=tuple(triggers), frames=tuple(frames), imu=tuple(imu)
+    )
 
 
 def in_pieces(columns: Columns, cuts: Sequence[int]) -> list[Columns]:
@@ -72,6 +81,18 @@ def read_all(path: Path, max_bytes: int = 1 << 20) -> tuple[Columns, list[Trigge
             triggers += chunk.triggers
             frames += chunk.frames
     return columns, triggers, frames
+
+
+def read_imu(path: Path) -> list[ImuSample]:
+    """Read a recording's inertial samples."""
+    with closing(open_recording(path)) as reader:
+        return [one for chunk in EventStream(reader).chunks() for one in chunk.imu]
+
+
+def sample(t_us: int, seed: int = 0) -> ImuSample:
+    """Return an inertial sample of which 32-bit floats in the units of AEDAT4 hold every number."""
+    g, degrees = np.random.default_rng(seed).integers(-1000, 1000, (2, 3)).tolist()
+    return ImuSample(SensorUs(t_us), acceleration_m_s2(tuple(g)), rotation_rad_s(tuple(degrees)), 30.5)
 
 
 def edge(t_us: int, channel: int = 0, *, rising: bool = True) -> Trigger:

@@ -12,6 +12,7 @@ import base64
 import contextlib
 import json
 import math
+import os
 import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Self
@@ -53,6 +54,8 @@ class FakeDaemon:
         self.last: dict[str, Any] | None = None
         self.focusing: asyncio.Future[dict[str, Any]] | None = None
         self.silent: set[str] = set()
+        self.holder: dict[str, Any] | None = None
+        """Who has the lease; the gateway runs in this process."""
         self._listeners: dict[asyncio.StreamWriter, int] = {}
         self._writers: set[asyncio.StreamWriter] = set()
         self._server: asyncio.Server | None = None
@@ -180,6 +183,9 @@ class FakeDaemon:
             given = params.model_dump(mode="json", exclude_unset=True)
             if messages.operates(method, params) and self.role != "operate":
                 raise Refused("Forbidden", "user 1234 is not in group elpd-operators")
+            kept = self.holder is not None and self.holder["pid"] != os.getpid()
+            if kept and messages.operates(method, params) and method not in {"cancel", "stop"}:
+                raise Refused("Busy", "somebody holds the lease for another 12 s; wait, or ask them")
             result = await self._do(method, given, writer)
             answer: dict[str, Any] = {"result": result}
         except Refused as refused:
@@ -235,11 +241,20 @@ class FakeDaemon:
                 "driver": "sim", "width": WIDTH, "height": HEIGHT, "has_frames": False, "connected": True,
                 "events": 1_234_567, "events_per_s": 812_000.0,
             },
-            "aperture": {"driver": "sim"}, "roi": self.roi, "lease": {"holder": None, "until_s": 0.0},
+            "aperture": {"driver": "sim"}, "roi": self.roi, "lease": self._leased(),
             "last": self.last, "warnings": self.warnings, "counters": {"requests": 3, "focused": 2},
             "latency": {"decide": {"p50_us": 90.0, "p99_us": 310.0, "max_us": 900.0}}, "ticks": {"loop": 0.01},
             "uptime_s": 4210.0, "rss_mb": 131.0, "version": "0.1.0", "rig": "sim",
         }  # fmt: skip
+
+    def _leased(self) -> dict[str, Any]:
+        return {"holder": self.holder, "until_s": 0.0 if self.holder is None else 12.0}
+
+    def _lease(self, action: str = "acquire", seconds: float = 10.0) -> dict[str, Any]:
+        if action == "renew" and self.holder is None:
+            raise Refused("Busy", f"the lease of {seconds:g} s has ended and cannot be renewed; acquire it again")
+        self.holder = None if action == "release" else {"pid": os.getpid(), "uid": 0, "name": "elpd web"}
+        return self._leased()
 
     def _stop(self) -> dict[str, Any]:
         moving, self.moving = self.moving, False

@@ -20,6 +20,8 @@ from elpd.web.security import Gate, own_hosts
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
 
+    from aiohttp import web
+
 TOKEN = "t0ken-of-this-test-" + 30 * "x"
 
 
@@ -38,6 +40,7 @@ class Gateway:
     daemon: FakeDaemon
     session: aiohttp.ClientSession
     port: int
+    app: web.Application
     host: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -97,10 +100,11 @@ async def gateway(*, hosts: tuple[str, ...] = (), with_daemon: bool = True) -> A
         listening = create_server(("127.0.0.1", 0))
         port = listening.getsockname()[1]
         gate = Gate(own_hosts("127.0.0.1", port, hosts), TOKEN)
-        serving = asyncio.create_task(serve(build_app(daemon.path, gate), listening))
+        app = build_app(daemon.path, gate)
+        serving = asyncio.create_task(serve(app, listening))
         try:
             async with aiohttp.ClientSession() as session:
-                yield Gateway(daemon, session, port)
+                yield Gateway(daemon, session, port, app)
         finally:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)

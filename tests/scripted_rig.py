@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -71,6 +71,19 @@ class AbleCamera(Camera):
         self.set_window = self.apply_biases = self.set_mask = self.close = script.next
 
 
+class EveryCamera(AbleCamera):
+    """One that can all that a camera may be able to."""
+
+    serial = "00000499"
+    counters: ClassVar = {"packets": 7, "rate": float("inf")}
+    remarks = ("use a port of its own",)
+
+    def __init__(self, script: Script) -> None:
+        super().__init__(script)
+        self.limit_rate = self.temperature_c = self.reopen = script.next
+        self.enable_trigger = self.enable_imu = lambda *, on: script.next(on)
+
+
 class Lens:
     limits = LIMITS
     capabilities = CAPABILITIES
@@ -80,6 +93,30 @@ class Lens:
 
 
 class CloseableLens(Lens):
+    def __init__(self, script: Script) -> None:
+        super().__init__(script)
+        self.close = script.next
+
+
+class EveryLens(CloseableLens):
+    """One that can all that a lens may be able to."""
+
+    serial, mark_channel, outputs = "L7", 6, ("iris",)
+    remarks = ("the adapter is slow",)
+
+    def __init__(self, script: Script) -> None:
+        super().__init__(script)
+        self.mark = script.next
+        self.set_output = lambda name, *, on: script.next(name, on)
+        self._script = script
+
+    def learn_stops(self, measured: Any) -> None:
+        self.capabilities = self._script.next(measured)
+
+
+class PacedClock(Clock):
+    lag_s = 0.25
+
     def __init__(self, script: Script) -> None:
         super().__init__(script)
         self.close = script.next
@@ -97,10 +134,11 @@ def scripted_rig(
     camera: type[Camera] = AbleCamera,
     lens: type[Lens] = CloseableLens,
     aperture: type[Aperture] | None = Aperture,
+    clock: type[Clock] = Clock,
 ) -> RigParts:
     script = Script(answers)
     return RigParts(
-        clock=Clock(script),
+        clock=clock(script),
         camera=camera(script),
         lens=lens(script),
         aperture=None if aperture is None else aperture(script),

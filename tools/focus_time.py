@@ -21,7 +21,8 @@ import numpy as np
 
 from elpd import rig
 from elpd.config import Config, load
-from elpd.focus import cycle
+from elpd.focus import cycle, watch
+from elpd.focus.aftermath import Aftermath
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.focus.watch import Watch
 from elpd.units import HostNs
@@ -42,37 +43,47 @@ class Nowhere:
         """Take a note, and forget it."""
 
 
-class TimedWatch(Watch):
-    """A watch whose computing is measured and, where there is a clock, charged to it."""
+class Meter:
+    """What computing has taken in one cycle; where there is a clock it is charged to it."""
 
     clock: Clock | None = None
     spent_ms: dict[str, float] = {}  # noqa: RUF012  (one cycle at a time)
+
+    @classmethod
+    def charge(cls, what: str, begun: float) -> None:
+        """Charge what was computed since *begun* to the world."""
+        spent = time.thread_time() - begun
+        cls.spent_ms[what] = cls.spent_ms.get(what, 0.0) + 1e3 * spent
+        if cls.clock is not None:
+            cls.clock.sleep_until(HostNs(cls.clock.now_ns() + round(1e9 * spent)))
+
+
+class TimedWatch(Watch):
+    """A watch whose computing is metered."""
 
     def feed(self, packet: CameraPacket) -> list[ElpSample]:
         """Judge a packet."""
         begun = time.thread_time()
         samples = super().feed(packet)
-        self._charge("watch", begun)
+        Meter.charge("watch", begun)
         return samples
+
+
+class TimedAftermath(Aftermath):
+    """An aftermath whose computing is metered."""
 
     def hear_out(self, packet: CameraPacket) -> None:
         """Take a packet after the decision."""
         begun = time.thread_time()
         super().hear_out(packet)
-        self._charge("watch", begun)
+        Meter.charge("watch", begun)
 
     def estimate(self) -> FocusEstimate | None:
         """Say where focus was."""
         begun = time.thread_time()
         found = super().estimate()
-        self._charge("estimate", begun)
+        Meter.charge("estimate", begun)
         return found
-
-    def _charge(self, what: str, begun: float) -> None:
-        spent = time.thread_time() - begun
-        self.spent_ms[what] = self.spent_ms.get(what, 0.0) + 1e3 * spent
-        if self.clock is not None:
-            self.clock.sleep_until(HostNs(self.clock.now_ns() + round(1e9 * spent)))
 
 
 def main() -> int:
@@ -88,6 +99,7 @@ def main() -> int:
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
     cycle.Watch = TimedWatch  # type: ignore[misc]
+    watch.Aftermath = TimedAftermath  # type: ignore[misc]
     overrides = [f"sim.board={chosen.board}", f"sim.camera={chosen.camera}", *chosen.set, "journal.enabled=false"]
     config = load(overrides=overrides)
     focus(config, chosen.first, charge=False)  # warms caches up
@@ -108,7 +120,7 @@ def focus(config: Config, seed: int, *, charge: bool) -> dict[str, Any]:
     lens = config.lens.model_copy(update={"first_direction": "up" if up else "down"})
     config = config.model_copy(update={"sim": sim, "lens": lens})
     parts = rig.build(config)
-    TimedWatch.clock, TimedWatch.spent_ms = parts.clock if charge else None, {}
+    Meter.clock, Meter.spent_ms = parts.clock if charge else None, {}
     try:
         result = cycle.FocusCycle(parts, CycleSettings.from_config(config), FocusRequest(), Nowhere()).run()
         truth = {} if parts.truth is None else parts.truth.errors(result)
@@ -118,7 +130,7 @@ def focus(config: Config, seed: int, *, charge: bool) -> dict[str, Any]:
     row: dict[str, Any] = {"seed": seed, "scene": getattr(parts.truth, "scene", ""), "outcome": result.outcome.value}
     row |= {f"{name}_ms": took.get(name) for name in PHASES}
     row["total_ms"] = sum(took.get(name, 0.0) for name in PHASES)
-    row |= {f"cpu_{name}_ms": TimedWatch.spent_ms.get(name, 0.0) for name in ("watch", "estimate")}
+    row |= {f"cpu_{name}_ms": Meter.spent_ms.get(name, 0.0) for name in ("watch", "estimate")}
     return row | {"overshoot_um": _beyond(truth.get("stop_error_um"), up=up), "final_error_um": truth["final_error_um"]}
 
 

@@ -51,8 +51,8 @@ def command(
     length = out.stat().st_size
     print(f"{out}: {answer['format']}, {answer['width']}x{answer['height']}")
     print(f"events    {answer['events']:,}, {length:,} bytes")
-    if answer["triggers"] or answer["frames"]:
-        print(f"with it   {answer['triggers']} trigger edges, {answer['frames']} frames")
+    if answer["triggers"] or answer["frames"] or answer["imu"]:
+        print(f"with it   {answer['triggers']} trigger edges, {answer['frames']} frames, {answer['imu']:,} IMU samples")
     if answer["lost"]:
         print(f"lost      {answer['lost']:,} in the source: " + "; ".join(answer["lost_reason"]))
     for warning in answer["warnings"]:

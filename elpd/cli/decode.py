@@ -70,7 +70,7 @@ def summarise(reader: RecordingReader) -> dict[str, Any]:
         "last_us": tally.last_us,
         "triggers": triggers,
         "frames": tally.frames,
-        "imu": int(notes.get("imu", 0)),
+        "imu": tally.imu,
         "rate_controller": None if rate is None else {"before": rate[0], "after": rate[1]},
         "digest": {name: digest.hexdigest()[:12] for name, digest in digests.items()},
         "lost": lost,
@@ -96,6 +96,8 @@ def _lines(file: Path, summary: dict[str, Any]) -> list[str]:
         lines.append(f"          and {len(summary['triggers']) - 20} more trigger edges")
     if summary["frames"]:
         lines.append(f"frames    {summary['frames']}")
+    if summary["imu"]:
+        lines.append(f"imu       {summary['imu']:,} samples")
     if summary["rate_controller"]:
         lines.append(
             "rate controller: {before:,} events before it, {after:,} after".format(**summary["rate_controller"])

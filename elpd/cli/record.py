@@ -70,8 +70,8 @@ def command(
     size = Path(answer["out"]).stat().st_size
     print(f"{answer['out']}: {answer['format']}, {answer['width']}x{answer['height']}, {answer['seconds']:.3f} s")
     print(f"events    {answer['events']:,}, {size:,} bytes")
-    if answer["triggers"] or answer["frames"]:
-        print(f"with it   {answer['triggers']} trigger edges, {answer['frames']} frames")
+    if answer["triggers"] or answer["frames"] or answer["imu"]:
+        print(f"with it   {answer['triggers']} trigger edges, {answer['frames']} frames, {answer['imu']:,} IMU samples")
     if answer["lost"]:
         print(f"lost      {answer['lost']:,}: " + "; ".join(answer["lost_reason"]))
     for warning in answer["warnings"]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from elpd.events.decoder import WordDecoder
     from elpd.ports import RecordingFormat, RecordingReader
-    from elpd.records import CameraPacket, Frame, Trigger
+    from elpd.records import CameraPacket, Frame, ImuSample, Trigger
 
 FORMATS_GROUP = "elpd.formats"
 DECODERS: dict[Encoding, Callable[[Geometry], WordDecoder]] = {
@@ -41,7 +41,8 @@ DECODERS: dict[Encoding, Callable[[Geometry], WordDecoder]] = {
 class EventChunk(NamedTuple):
     """Consecutive events of a recording: views, valid until the next chunk.
 
-    ``t`` int64 us, ``x`` and ``y`` uint16, ``p`` uint8 (1 is ON); ``triggers`` and ``frames`` that came with them.
+    ``t`` int64 us, ``x`` and ``y`` uint16, ``p`` uint8 (1 is ON); ``triggers``, ``frames`` and ``imu`` that came
+    with them.
     """
 
     t: NDArray[np.int64]
@@ -50,6 +51,7 @@ class EventChunk(NamedTuple):
     p: NDArray[np.uint8]
     triggers: tuple[Trigger, ...] = ()
     frames: tuple[Frame, ...] = ()
+    imu: tuple[ImuSample, ...] = ()
 
 
 def installed_formats() -> dict[str, RecordingFormat]:
@@ -140,14 +142,14 @@ class EventStream:
                     if not inside.all():
                         self._outside += int(inside.size - inside.sum())
                         t, x, y, p = t[inside], x[inside], y[inside], p[inside]
-                yield EventChunk(t, x, y, p, packet.triggers, packet.frames)
+                yield EventChunk(t, x, y, p, packet.triggers, packet.frames, packet.imu)
                 continue
             if self._decoder is None:
                 self._decoder = DECODERS[packet.encoding](self._geometry or Geometry(MAX_SIDE, MAX_SIDE))
             if packet.gap_before:
                 self._decoder.forget_addresses()
             events = self._decoder.feed(packet.data)
-            yield EventChunk(*events, packet.triggers + self._decoder.triggers, packet.frames)
+            yield EventChunk(*events, packet.triggers + self._decoder.triggers, packet.frames, packet.imu)
 
     @property
     def counters(self) -> dict[str, int]:

@@ -33,7 +33,11 @@ RETURN_SIGMAS = 6.0
 """Under a lamp, how certainly the way back must have undone what the way out had done."""
 
 RETURN_SHARE = 0.5
-"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least."""
+"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least.
+
+Where the scene moves, events come whether the lens moves or not, and twice as many at one time as at another. There the
+image has to become sharper again by half of what it had lost, which motion does not do to it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,14 +138,14 @@ def come_to_rest(stage: Stage, watch: Watch, stop: CommandStamp, way: WayBack, s
     """
     capabilities = stage.parts.lens.capabilities
     ended_ns = after_ms(stop.done_ns, capabilities.stop_onset_ms)
-    watch.turn(stage.sensor_clock.to_sensor(ended_ns))
+    watch.after.turn(stage.sensor_clock.to_sensor(ended_ns))
     if capabilities.abrupt_stop and capabilities.native_velocity:
-        way.set_out(watch.roughly_um)
-        watch.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
+        way.set_out(watch.after.roughly_um)
+        watch.after.go_back(stage.sensor_clock.to_sensor(after_ms(ended_ns, AFTERGLOW_MS)))
         stage.hear(safety.CAMERA_SILENCE_MS)
     else:
         stage.rest(REST_LIMIT_MS)
-        watch.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
+        watch.after.go_back(stage.sensor_clock.to_sensor(stage.now_ns()))
     return standstill(stage, watch, stop, sign)
 
 
@@ -157,13 +161,23 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
             f"the lens rests {error_um:+.1f} um from where it was sent; check the motor current and the mechanics",
         )
     stage.hear(safety.CAMERA_SILENCE_MS)
-    score = watch.return_score(focus_um)
-    from_um = stage.position_um(watch.back_from_us)
+    score = watch.after.return_score(focus_um)
+    from_um = stage.position_um(watch.after.back_from_us)
     resting_hz, way_back_um = watch.resting_rate_hz, abs(from_um - focus_um)
-    passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.back_from_us)) / NS_PER_S
-    seen = watch.events_back - round(resting_hz * passed_s)
-    expected = watch.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
+    passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.after.back_from_us)) / NS_PER_S
+    seen = watch.after.events_back - round(resting_hz * passed_s)
+    expected = watch.after.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if score is not None and score >= RETURN_SIGMAS:
+        return seen
+    sharpened = watch.after.sharpened_again()
+    if sharpened is not None:
+        if way_back_um > settings.depth_of_focus_um and sharpened < RETURN_SHARE:
+            raise Ended(
+                Outcome.LENS_DID_NOT_MOVE,
+                f"the controller says that the lens went back {way_back_um:.0f} um, but the image became sharper by "
+                f"{sharpened:.0%} of what it had lost on the way out (at least {RETURN_SHARE:.0%}); check the coupling "
+                "between motor and lens",
+            )
         return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
         raise Ended(

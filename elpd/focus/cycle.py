@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from elpd.errors import DeviceError, UsageError
 from elpd.focus import guards, judging, recross, safety
+from elpd.focus.aftermath import WatchSettings
 from elpd.focus.approach import WayBack, come_to_rest, verify
 from elpd.focus.aside import stand_aside
 from elpd.focus.ended import Beside, Ended, ended_by
@@ -24,7 +25,7 @@ from elpd.focus.passes import Play
 from elpd.focus.scene import Scene, check_roi, widened
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
-from elpd.focus.watch import Watch, WatchSettings
+from elpd.focus.watch import Watch
 from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
     BiasSet,
@@ -45,6 +46,7 @@ from elpd.vision.resting import LISTEN_MS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.focus.picture import Picture
     from elpd.focus.settings import CycleSettings, FocusRequest
     from elpd.focus.sweep import SweepReport
     from elpd.ports import RigParts, RunSink
@@ -171,7 +173,7 @@ class FocusCycle:
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        watch = self._arm(reference, roi, frames=picture.map is None)
+        watch = self._arm(reference, roi, picture)
         if self._request.dry_run:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         try:
@@ -186,7 +188,7 @@ class FocusCycle:
         way = WayBack(self._stage, self._settings, sign)
         ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
-        first, furthest_um = watch.estimate(), ended.um
+        first, furthest_um = watch.after.estimate(), ended.um
         if recross.is_needed(watch):
             first, furthest_um = self._pass_again(watch, first, sign)
             way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
@@ -197,7 +199,7 @@ class FocusCycle:
         self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
 
-    def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
+    def _arm(self, reference: Reference, roi: Roi, picture: Picture) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
         camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
@@ -213,11 +215,15 @@ class FocusCycle:
             roi,
             geometry,
             WatchSettings(
-                settings.speed_um_s, settings.depth_of_focus_um, Play.up_to(settings.backlash_um), frames=frames
+                settings.speed_um_s,
+                settings.depth_of_focus_um,
+                Play.up_to(settings.backlash_um),
+                frames=picture.map is None,
             ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
             sensor,
+            picture.levels,
         )
         self._watch = watch
         self._stage.listener = watch.rest
@@ -242,16 +248,13 @@ class FocusCycle:
 
     def _search_from_aside(self) -> SweepReport:
         """Go off focus, where the lens began in it, and look for it as from anywhere else: with a picture of there."""
-        turned = self._reversals
         self._stage.listener, self._stage.interrupt = None, self._interrupt
+        self._warnings = []  # the sensor at rest is asked anew
         towards = stand_aside(self._stage, self._settings, int(self._details["sweep_sign"]))
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        try:
-            return self._search(self._arm(reference, roi, frames=picture.map is None), towards)
-        finally:
-            self._reversals += turned
+        return self._search(self._arm(reference, roi, picture), towards)
 
     def _search(self, watch: Watch, from_aside: int = 0) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
@@ -268,6 +271,7 @@ class FocusCycle:
             cancelled=self._cancelled,
             interrupt=self._interrupt,
             from_aside=from_aside,
+            reversals=self._reversals,
         )
         try:
             return search.run()
@@ -292,11 +296,11 @@ class FocusCycle:
                 "the sign changed, but no estimator agrees on where; try again with a larger ROI or more light",
             )
         self._estimate = estimate
-        self._warnings += guards.of_depths(watch.depths_um) + guards.of_late_lamp(watch.flicker)
+        self._warnings += guards.of_depths(watch.after.depths_um) + guards.of_late_lamp(watch.after.flicker)
         self._details["method"] = estimate.method
         self._details["contributions"] = [list(item) for item in estimate.contributions]
         self._sink.note("estimate", focus_um=estimate.focus_um, sigma_um=estimate.sigma_um, method=estimate.method)
-        lost = self._stage.lost_events if watch.gap_near_crossing else None
+        lost = self._stage.lost_events if watch.after.gap_near_crossing else None
         judging.demand(estimate, self._settings, sign, way_um, lost)
         return estimate
 
@@ -387,6 +391,9 @@ class FocusCycle:
 
     def _result(self, outcome: Outcome, reason: str, final_um: float) -> FocusResult:
         estimate = self._estimate
+        shake_rad_s = self._stage.shake.rms_rad_s
+        if shake_rad_s is not None:
+            self._details["shake_rad_s"] = shake_rad_s
         ends = [at for _, at in self._phases[1:]]
         phases = tuple(
             PhaseTime(phase.value, (end - at) / NS_PER_MS) for (phase, at), end in zip(self._phases, ends, strict=False)

@@ -42,7 +42,7 @@ def is_needed(watch: Watch) -> bool:
     mixture look certain, so such an answer is refused as it is. Where events were lost near focus, or a lamp flickers,
     other passes would not help.
     """
-    return watch.scene_moves and not watch.gap_near_crossing and not watch.lit
+    return watch.scene_moves and not watch.after.gap_near_crossing and not watch.lit
 
 
 def pass_again(
@@ -64,14 +64,14 @@ def pass_again(
     furthest_um = stage.here_um()
     for _ in range(MOST_ROUNDS):
         begun_ns = stage.now_ns()
-        about_um = watch.peak_um if estimate is None else estimate.focus_um
+        about_um = watch.after.peak_um if estimate is None else estimate.focus_um
         doubt_um = MOST_DOUBT_DOF * settings.depth_of_focus_um
         if estimate is not None:
             doubt_um = min(doubt_um, estimate.sigma_um)
         for way in (sign, -sign):
             rest_um = _pass(stage, watch, settings, about_um, doubt_um, way)
             furthest_um = sign * max(sign * furthest_um, sign * rest_um)
-            estimate = watch.estimate()
+            estimate = watch.after.estimate()
         took_ns = stage.now_ns() - begun_ns
         if estimate is not None and estimate.sigma_um <= most_um:
             break
@@ -88,15 +88,15 @@ def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, 
     ramp_um = speed_um_s**2 / (2.0 * stage.to_um(limits.acceleration_sps2))
     away_um = reach_um + ramp_um + settings.backlash_um + APPROACH_MARGIN_UM
     begin_um, end_um = (stage.within_limits_um(about_um + side * way * away_um) for side in (-1, 1))
-    watch.catch_up()
+    watch.after.catch_up()
     stage.listener = watch.follow
     if abs(stage.here_um() - begin_um) > stage.um_per_step:
         stage.move(begin_um, stage.to_um(limits.max_speed_sps))
     stage.hear(safety.CAMERA_SILENCE_MS)
-    watch.begin_again(way, stage.sensor_clock.to_sensor(stage.now_ns()), about_um - way * reach_um)
-    stage.listener = watch.pass_again
+    watch.after.begin_again(way, stage.sensor_clock.to_sensor(stage.now_ns()), about_um - way * reach_um)
+    stage.listener = watch.after.pass_again
     rest = stage.move(end_um, speed_um_s)
     stage.hear(safety.CAMERA_SILENCE_MS)
-    watch.passed_again()
-    stage.listener = watch.hear_out
+    watch.after.passed_again()
+    stage.listener = watch.after.hear_out
     return stage.to_um(rest.steps)

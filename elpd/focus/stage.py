@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import CameraError, LensError
 from elpd.events.edges import EdgeReader
+from elpd.focus.shake import Shake
 from elpd.ports import Latency, TakesMarks, TriggerInput
 from elpd.timebase import SensorClock
 from elpd.units import NS_PER_MS, HostNs, SensorUs, Steps, after_ms
@@ -56,6 +57,8 @@ class Stage:
         self._edges = EdgeReader() if wired else None
         self.marks = 0 if wired else None
         """How many position marks were believed; ``None`` where none are wired."""
+        self.shake = Shake()
+        """What the camera's gyroscope says of the rig, where it has one."""
         self.shedding: Shedding | None = None
         """Lets packets go while too much waits; only a sweep cannot wait."""
         self.interrupt: Callable[[], None] | None = None
@@ -117,6 +120,8 @@ class Stage:
             self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
         if packet.frames:
             self.frame = packet.frames[-1]
+        if packet.imu:
+            self.shake.hear(packet.imu)
         if self._edges is not None:
             self._mark(self._edges.of(packet))
         if self.listener is not None:

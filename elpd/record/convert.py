@@ -66,6 +66,7 @@ class Slice:
             chunk.p[keep],
             tuple(edge for edge in chunk.triggers if self._at(edge.t_us)),
             tuple(frame for frame in chunk.frames if self._at(frame.t_us)),
+            tuple(one for one in chunk.imu if self._at(one.t_us)),
         )
 
     def _at(self, t_us: int) -> bool:
@@ -160,11 +161,13 @@ class Conversion:
             as_they_are = self._part.whole and packet.encoding is traits.encoding
             kept = chunk if as_they_are else self._shifted(self._part.of(chunk), traits)
             if as_they_are:
-                self._writer.write(replace(packet, triggers=(), frames=()))
-            elif kept.t.size or kept.triggers or kept.frames:
+                self._writer.write(replace(packet, triggers=(), frames=(), imu=()))
+            elif kept.t.size or kept.triggers or kept.frames or kept.imu:
                 data = packed(kept.t, kept.x, kept.y, kept.p)
                 self._writer.write(
-                    CameraPacket(data, Encoding.ARRAY, HostNs(0), triggers=kept.triggers, frames=kept.frames)
+                    CameraPacket(
+                        data, Encoding.ARRAY, HostNs(0), triggers=kept.triggers, frames=kept.frames, imu=kept.imu
+                    )
                 )
             written.add(kept)
         lost, reasons = losses(self._reader.notes, self._stream.counters, self._stream.rate_controller)
@@ -179,6 +182,7 @@ class Conversion:
             "last_us": written.last_us,
             "triggers": written.triggers if traits.triggers else 0,
             "frames": written.frames if traits.frames else 0,
+            "imu": written.imu if traits.imu else 0,
             "shift_us": self._shift_us or 0,
             "lost": lost,
             "lost_reason": reasons,
@@ -192,8 +196,8 @@ class Conversion:
             left.append(f"{written.triggers} trigger edges")
         if written.frames and not traits.frames:
             left.append(f"{written.frames} frames")
-        if self._reader.notes.get("imu"):
-            left.append(f"{self._reader.notes['imu']} IMU samples")
+        if written.imu and not traits.imu:
+            left.append(f"{written.imu} IMU samples")
         if not as_they_are and self._stream.rate_controller is not None:
             left.append("the rate controller's counts")
         if not as_they_are and self._stream.counters.get("others"):

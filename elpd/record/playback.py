@@ -240,6 +240,7 @@ class TapeReader:
             gap_before=line.get("gap_before", False),
             lost_events=line.get("lost_events", 0),
             backlog=line.get("backlog", 0),
+            imu=tuple(_sample(*row) for row in line.get("imu", ())),
         )
 
     def _array(self, line: dict[str, Any]) -> NDArray[Any]:
@@ -287,6 +288,11 @@ def _report(line: dict[str, Any]) -> records.LensReport:
     )
 
 
+def _sample(t_us: int, *measured: Any) -> records.ImuSample:
+    ax, ay, az, gx, gy, gz, celsius = (number(value) for value in measured)
+    return records.ImuSample(SensorUs(t_us), (ax, ay, az), (gx, gy, gz), celsius)
+
+
 def _stamp(line: dict[str, Any]) -> records.CommandStamp:
     return records.CommandStamp(line["command"], HostNs(line["begun_ns"]), HostNs(line["done_ns"]))
 
@@ -295,13 +301,24 @@ def _position(line: dict[str, Any]) -> records.PositionEstimate:
     return records.PositionEstimate(number(line["steps"]), number(line["sigma_steps"]))
 
 
-_DECODERS: dict[str, Callable[[dict[str, Any]], Any]] = {
+def _capabilities(line: dict[str, Any]) -> records.LensCapabilities:
+    return records.LensCapabilities(**{name: number(value) for name, value in line.items()})
+
+
+_DECODERS: dict[str, Callable[[Any], Any]] = {
     "lens.home": _report,
     "lens.poll": _report,
     "lens.move_to": _stamp,
     "lens.run": _stamp,
     "lens.stop": _stamp,
     "lens.position_at": _position,
+    "lens.set_output": _stamp,
+    "lens.learn_stops": _capabilities,
+    "lens.remarks": tuple,
+    "camera.remarks": tuple,
+    "camera.temperature_c": number,
+    "camera.counters": lambda counts: {name: number(value) for name, value in counts.items()},
+    "clock.lag_s": number,
     "aperture.open": _stamp,
     "aperture.close": _stamp,
 }
@@ -317,12 +334,14 @@ def _facts(line: dict[str, Any]) -> RigFacts:
             max_speed_sps=number(limits["max_speed_sps"]),
             acceleration_sps2=number(limits["acceleration_sps2"]),
         ),
-        capabilities=records.LensCapabilities(**{name: number(value) for name, value in capabilities.items()}),
+        capabilities=_capabilities(capabilities),
         um_per_step=number(line["um_per_step"]),
         steps_to_um=tuple((number(steps), number(um)) for steps, um in line.get("steps_to_um", ())),
         opening_ms=number(line["opening_ms"]),
         min_latency_us=number(line["min_latency_us"]),
         mark_channel=line.get("mark_channel"),
+        serials=line.get("serials", {}),
+        outputs=tuple(line.get("outputs", ())),
         abilities={device: tuple(names) for device, names in line["abilities"].items()},
     )
 

@@ -296,6 +296,7 @@ def _answer(out: Path, ended: Ended, live: _Live, told: Sequence[str]) -> dict[s
         "last_us": tally.last_us,
         "triggers": tally.triggers,
         "frames": tally.frames,
+        "imu": tally.imu,
         "lost": lost + live.lost_events,
         "lost_reason": reasons,
         "warnings": warnings,

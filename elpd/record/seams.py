@@ -11,20 +11,20 @@ Properties are read once, when the rig is taped, and are constants from then on,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask, RigParts, TakesMarks, TriggerInput
+from elpd.ports import Identified, Latency, Outputs, RigParts, TakesMarks
+from elpd.record.abilities import ABILITIES, Double, abilities_of, ability_methods
 from elpd.scale import LensScale
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     import numpy as np
     from numpy.typing import NDArray
 
     from elpd.ports import Aperture, Clock, EventCamera, Lens
     from elpd.records import (
-        BiasSet,
         CameraPacket,
         CommandStamp,
         Geometry,
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         LensLimits,
         LensReport,
         PositionEstimate,
-        Roi,
         StopMode,
     )
     from elpd.units import HostNs, Steps
@@ -62,11 +61,14 @@ class RigFacts:
     opening_ms: float | None
     min_latency_us: float | None
     mark_channel: int | None
+    serials: dict[str, str]
+    outputs: tuple[str, ...]
     abilities: dict[str, tuple[str, ...]]
 
     @classmethod
     def of(cls, parts: RigParts) -> RigFacts:
         """Read every property of *parts* once. ``opening_ms`` is ``None`` where there is no aperture."""
+        devices = _devices(parts)
         camera = parts.camera
         return cls(
             geometry=camera.geometry,
@@ -77,11 +79,9 @@ class RigFacts:
             opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
             min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
             mark_channel=parts.lens.mark_channel if isinstance(parts.lens, TakesMarks) else None,
-            abilities={
-                "clock": _abilities(parts.clock, ("Closeable",)),
-                "camera": _abilities(camera, tuple(_PROTOCOLS)),
-                "lens": _abilities(parts.lens, ("Closeable", "TakesMarks")),
-            },
+            serials={name: device.serial for name, device in devices.items() if isinstance(device, Identified)},
+            outputs=tuple(parts.lens.outputs) if isinstance(parts.lens, Outputs) else (),
+            abilities={name: abilities_of(name, device) for name, device in devices.items()},
         )
 
 
@@ -89,7 +89,7 @@ def build_doubles(facts: RigFacts, channel: Channel) -> RigParts:
     """Return a rig that asks *channel* for everything that is not constant. It knows no truth."""
 
     def make(device: str, base: type) -> Any:
-        mixins = tuple(_MIXINS[name] for name in facts.abilities.get(device, ()))
+        mixins = tuple(ABILITIES[device][name].double for name in facts.abilities.get(device, ()))
         return type(base.__name__, (base, *mixins), {})(facts, channel)
 
     return RigParts(
@@ -123,33 +123,17 @@ def methods_of(parts: RigParts) -> dict[str, Callable[..., Any]]:
             "aperture.close": aperture.close,
             "aperture.transmittance": aperture.transmittance,
         }
-    if isinstance(camera, HardwareRoi):
-        methods["camera.set_window"] = camera.set_window
-    if isinstance(camera, Biases):
-        methods["camera.apply_biases"] = camera.apply_biases
-    if isinstance(camera, PixelMask):
-        methods["camera.set_mask"] = camera.set_mask
-    if isinstance(camera, TriggerInput):
-        listening = camera.enable_trigger
-        methods["camera.enable_trigger"] = lambda on: listening(on=on)
-    if isinstance(lens, TakesMarks):
-        methods["lens.mark"] = lens.mark
-    for name, device in (("clock", clock), ("camera", camera), ("lens", lens)):
-        if isinstance(device, Closeable):
-            methods[f"{name}.close"] = device.close
+    for name, device in _devices(parts).items():
+        methods |= ability_methods(name, device)
     return methods
 
 
-class _Double:
-    device: ClassVar[str]
-
-    def __init__(self, facts: RigFacts, channel: Channel) -> None:
-        self._facts = facts
-        self._ask = channel.ask
-        self._ask_array = channel.ask_array
+def _devices(parts: RigParts) -> dict[str, object]:
+    devices: dict[str, object] = {"clock": parts.clock, "camera": parts.camera, "lens": parts.lens}
+    return devices if parts.aperture is None else {**devices, "aperture": parts.aperture}
 
 
-class _ClockDouble(_Double):
+class _ClockDouble(Double):
     device = "clock"
 
     def now_ns(self) -> HostNs:
@@ -159,7 +143,7 @@ class _ClockDouble(_Double):
         self._ask("clock.sleep_until", when)
 
 
-class _CameraDouble(_Double):
+class _CameraDouble(Double):
     device = "camera"
 
     @property
@@ -176,8 +160,10 @@ class _CameraDouble(_Double):
         self._ask("camera.stop")
 
 
-class _LensDouble(_Double):
+class _LensDouble(Double):
     device = "lens"
+    learnt: LensCapabilities | None = None
+    """What it can do, as far as it was taught since it was taped."""
 
     @property
     def limits(self) -> LensLimits:
@@ -185,7 +171,7 @@ class _LensDouble(_Double):
 
     @property
     def capabilities(self) -> LensCapabilities:
-        return self._facts.capabilities
+        return self.learnt or self._facts.capabilities
 
     def home(self, deadline: HostNs) -> LensReport:
         return cast("LensReport", self._ask("lens.home", deadline))
@@ -206,7 +192,7 @@ class _LensDouble(_Double):
         return cast("PositionEstimate", self._ask("lens.position_at", when))
 
 
-class _ApertureDouble(_Double):
+class _ApertureDouble(Double):
     device = "aperture"
 
     def open(self) -> CommandStamp:
@@ -221,67 +207,3 @@ class _ApertureDouble(_Double):
 
     def transmittance(self, since_open_us: NDArray[np.float64]) -> NDArray[np.float64]:
         return self._ask_array("aperture.transmittance", since_open_us)
-
-
-class _WithHardwareRoi(_Double):
-    def set_window(self, window: Roi | None) -> None:
-        self._ask("camera.set_window", window)
-
-
-class _WithBiases(_Double):
-    def apply_biases(self, biases: BiasSet) -> None:
-        self._ask("camera.apply_biases", biases)
-
-
-class _WithPixelMask(_Double):
-    def set_mask(self, pixels: Sequence[tuple[int, int]]) -> int:
-        return cast("int", self._ask("camera.set_mask", tuple(pixels)))
-
-
-class _WithTriggerInput(_Double):
-    def enable_trigger(self, *, on: bool) -> None:
-        self._ask("camera.enable_trigger", on)
-
-
-class _WithLatency(_Double):
-    @property
-    def min_latency_us(self) -> float:
-        return cast("float", self._facts.min_latency_us)
-
-
-class _WithMarks(_Double):
-    @property
-    def mark_channel(self) -> int | None:
-        return self._facts.mark_channel
-
-    def mark(self, when: HostNs) -> bool:
-        return cast("bool", self._ask("lens.mark", when))
-
-
-class _WithClose(_Double):
-    def close(self) -> None:
-        self._ask(f"{self.device}.close")
-
-
-_PROTOCOLS: dict[str, Any] = {
-    "HardwareRoi": HardwareRoi,
-    "Biases": Biases,
-    "PixelMask": PixelMask,
-    "TriggerInput": TriggerInput,
-    "Latency": Latency,
-    "TakesMarks": TakesMarks,
-    "Closeable": Closeable,
-}
-_MIXINS: dict[str, type] = {
-    "HardwareRoi": _WithHardwareRoi,
-    "Biases": _WithBiases,
-    "PixelMask": _WithPixelMask,
-    "TriggerInput": _WithTriggerInput,
-    "Latency": _WithLatency,
-    "TakesMarks": _WithMarks,
-    "Closeable": _WithClose,
-}
-
-
-def _abilities(device: object, candidates: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(name for name in candidates if isinstance(device, _PROTOCOLS[name]))

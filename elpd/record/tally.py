@@ -34,7 +34,7 @@ class Tally:
 
     Attributes
     ----------
-    events, on, triggers, frames : int
+    events, on, triggers, frames, imu : int
     first_us, last_us : int or None
         Times of the first and last event, in stream order.
     step_back_us : int
@@ -44,7 +44,7 @@ class Tally:
     """
 
     def __init__(self) -> None:
-        self.events = self.on = self.triggers = self.frames = 0
+        self.events = self.on = self.triggers = self.frames = self.imu = 0
         self.first_us: int | None = None
         self.last_us: int | None = None
         self.step_back_us = 0
@@ -54,6 +54,7 @@ class Tally:
         """Count the next chunk."""
         self.triggers += len(chunk.triggers)
         self.frames += len(chunk.frames)
+        self.imu += len(chunk.imu)
         if chunk.t.size == 0:
             return
         self.events += chunk.t.size

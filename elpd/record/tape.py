@@ -45,6 +45,7 @@ ARRAYS_FILE = "arrays.bin"
 _EVT_VERSION = {Encoding.EVT2: "2.0", Encoding.EVT21: "2.1", Encoding.EVT3: "3.0"}
 _EVT_FORMAT = {Encoding.EVT2: "EVT2", Encoding.EVT21: "EVT21", Encoding.EVT3: "EVT3"}
 _ENTRY_BYTES = 400  # what one call occupies while it waits to be written, generously
+_SAMPLE_BYTES = 500  # likewise, of an inertial sample
 _PNG_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
 
 
@@ -201,6 +202,7 @@ class TapeWriter:
         size = _ENTRY_BYTES
         if type(answer) is CameraPacket:
             size += answer.data.nbytes + sum(frame.pixels.nbytes for frame in answer.frames)
+            size += _SAMPLE_BYTES * len(answer.imu)
         elif type(answer) is _Array:
             size += answer.values.nbytes
         if self._waiting_bytes + size > self._memory_limit_bytes:
@@ -265,6 +267,10 @@ class TapeWriter:
             line["frames"] = [self._frame(frame) for frame in packet.frames]
         if packet.triggers:
             line["triggers"] = [[trigger.t_us, trigger.id, trigger.rising] for trigger in packet.triggers]
+        if packet.imu:
+            line["imu"] = [
+                [one.t_us, *one.acceleration_m_s2, *one.rotation_rad_s, one.temperature_c] for one in packet.imu
+            ]
         if packet.gap_before:
             line["gap_before"] = True
         if packet.lost_events:

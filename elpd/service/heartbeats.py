@@ -24,6 +24,10 @@ class Heartbeats:
         self._allowed_s: dict[str, float] = {}
         self._beats_s: dict[str, float] = {}
 
+    def now_s(self) -> float:
+        """Return the present instant of the clock that beats are judged by."""
+        return self._now_s()
+
     def expect(self, loop: str, limit_s: float) -> None:
         """Expect *loop* to beat at least every *limit_s* from now on."""
         with self._lock:
@@ -59,6 +63,11 @@ class Heartbeats:
                 for loop, limit_s in self._limits_s.items()
                 if now_s - self._beats_s[loop] > max(limit_s, self._allowed_s.get(loop, 0.0))
             }
+
+    def limit_s(self, loop: str) -> float:
+        """Return for how long *loop* may be silent now; for ever, if it is not expected."""
+        with self._lock:
+            return max(self._limits_s.get(loop, float("inf")), self._allowed_s.get(loop, 0.0))
 
     def ages(self) -> dict[str, float]:
         """Return how long ago each loop beat."""

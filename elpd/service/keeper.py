@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from elpd import rig
-from elpd.errors import BusyError, DeviceError, LensError
+from elpd.errors import BusyError, ConfigError, DeviceError, FormatError, LensError
+from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,14 +47,22 @@ class RigKeeper:
         self.retry_at_s = 0.0
         """When the next attempt is due, on the engine's clock."""
 
+    @property
+    def in_real_time(self) -> bool:
+        """Whether the lens lives in the machine's own time, and moves on while nobody here does anything."""
+        return self.parts is not None and isinstance(self.parts.clock, MonotonicClock)
+
     def open(self, now_s: float) -> RigParts:
-        """Open the rig. Raises ``DeviceError`` or ``ConfigError``, after which the next attempt is due later."""
+        """Open the rig.
+
+        Raises ``DeviceError``, ``ConfigError`` or ``FormatError``, after which the next attempt is due later.
+        """
         try:
             parts = self._build(self.config)
         except BusyError as error:  # another program holds the port: the lens is as good as lost
             self._later(now_s)
             raise LensError(str(error)) from None
-        except DeviceError:
+        except (DeviceError, ConfigError, FormatError):
             self._later(now_s)
             raise
         self.parts, self._lens = parts, parts.lens

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 import structlog
 
 from elpd.records import Cancel, StopMode
+from elpd.service import overload
 from elpd.service.engine import FOCUS_LOOP
+from elpd.service.overload import Overload
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +32,9 @@ API_LIMIT_S = 1.5
 
 LOOK_EVERY_S = 0.1
 """How often the supervisor looks."""
+
+FORGOTTEN_AFTER_LOOKS = 600
+"""An overload is warned of until this long after the last."""
 
 END_S = 5.0
 """How long the lens may take to come to rest at the end, and the journal to be written."""
@@ -104,20 +109,45 @@ class EngineThreads:
 
 
 class Supervisor:
-    """Looks whether every loop lives; stops the lens of a focus thread that does not, once."""
+    """Looks whether every loop lives; stops the lens of a focus thread that does not, once.
 
-    def __init__(self, engine: RigEngine, notifier: Notifier) -> None:
+    A loop that the machine did not let run is not hung (``overload``). Its lens is stopped all the same where it moves
+    by itself meanwhile, and what runs is ended, but nothing is latched, and the watchdog is fed.
+
+    Parameters
+    ----------
+    engine, notifier
+        Whom it watches over, and who hears that all is well.
+    waited_s
+        Tells how long this process has stood in line for a processor.
+    """
+
+    def __init__(
+        self, engine: RigEngine, notifier: Notifier, waited_s: Callable[[], float] = overload.waited_s
+    ) -> None:
         self._engine = engine
         self._notifier = notifier
-        self._stopped = False
+        self._overload = Overload(waited_s)
+        self._told = ""
+        self._slow_looks_ago = FORGOTTEN_AFTER_LOOKS
 
     def look(self) -> None:
         """Look once."""
-        late = self._engine.heartbeats.late()
-        if FOCUS_LOOP in late and not self._stopped:
-            self._stop_for(late[FOCUS_LOOP])
-        self._stopped = FOCUS_LOOP in late
-        if not late:
+        beats = self._engine.heartbeats
+        late = beats.late()
+        self._overload.look(beats.now_s())
+        hung = {loop for loop, silent_s in late.items() if self._overload.hung(silent_s, beats.limit_s(loop))}
+        focus = "hung" if FOCUS_LOOP in hung else "slow" if FOCUS_LOOP in late else ""
+        if focus != self._told:
+            self._told = focus
+            if focus == "hung":
+                self._stop_for(late[FOCUS_LOOP])
+            elif focus == "slow":
+                self._bear_with(late[FOCUS_LOOP])
+        self._slow_looks_ago = 0 if late else self._slow_looks_ago + 1
+        if self._slow_looks_ago == FORGOTTEN_AFTER_LOOKS:
+            self._engine.situation.unwarn("overloaded")
+        if not hung:
             self._notifier.alive()
 
     def _stop_for(self, silent_s: float) -> None:
@@ -129,3 +159,17 @@ class Supervisor:
         log.error("focus thread hangs", silent_s=silent_s, limit_s=FOCUS_LIMIT_S)
         if self._engine.place.cancel_all(Cancel.HOLD, why):  # a machine that is slow while nothing is done harms nobody
             self._engine.situation.latch("Hang", f"{why}; see the log for where it hung, then clear")
+
+    def _bear_with(self, silent_s: float) -> None:
+        """Say that the machine is overloaded; what moves by itself meanwhile is stopped."""
+        starved_s = self._overload.starved_s(silent_s)
+        why = (
+            f"the machine is overloaded: the focus thread was silent for {silent_s:.1f} s (limit {FOCUS_LIMIT_S:g}), "
+            f"of which this process stood in line for {starved_s:.1f} s; end what else runs, or give the "
+            "daemon real-time priority"
+        )
+        if self._engine.keeper.in_real_time and self._engine.place.busy:
+            self._engine.keeper.stop_lens(StopMode.ABRUPT)
+            self._engine.place.cancel_all(Cancel.HOLD, f"{why}; the lens was stopped")
+        log.warning("machine overloaded", silent_s=silent_s, starved_s=starved_s, limit_s=FOCUS_LIMIT_S)
+        self._engine.situation.warn("overloaded", why)

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import structlog
 
+from elpd.service import memory
+
 KERNEL_ROOMS = ("elpd.events", "elpd.vision", "elpd.focus")
 
 SWITCH_INTERVAL_S = 5e-5
@@ -30,6 +32,7 @@ def warm_up() -> None:
         for path in sorted(folder.glob("*.py")):
             if path.stem != "__init__":
                 importlib.import_module(f"{room}.{path.stem}")
+    memory.drop_compiler()
     log.info("kernels ready", seconds=round(time.perf_counter() - begun_s, 3))
 
 
@@ -38,3 +41,5 @@ def settle() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
+    memory.drop_compiler()  # a simulated rig brought kernels of its own
+    memory.trim()

@@ -8,6 +8,13 @@ against their own median. With M independent frequencies a line is found by chan
 ``M·exp(-P)``; a line counts where that is below ``FALSE_ALARM`` *and* it carries a good share of all events, because
 a lamp that moves few pixels harms nobody.
 
+An object that goes by makes a line as well: its edge lies along the pixels' columns and enters a new one every 1/300 of
+a second. But it is over with a pixel when it takes the next, and what it does to a pixel that it comes back to (with
+another edge) is up or down as may be, while a lamp does in every period to every pixel what it did before. So the
+pixels of the first half of the record are compared with themselves in the second: the mean product of an event's phase
+in one and another's in the other, over pairs of the same pixel, is for a lamp what it is for pairs of any pixels, and
+zero for edges. Half of that is asked for, by as many standard deviations as ``FALSE_ALARM`` takes.
+
 What a lamp does to a pixel's level is undone after a whole period, whatever its depth, as long as the pixel can follow.
 So sums over whole periods are free of it; ``residue`` says how well that holds for this sensor and this lamp.
 """
@@ -36,6 +43,13 @@ LEAST_SHARE = 0.3
 """Amplitude of the swing over the rate of events: one where all events are the lamp's, a few hundredths in scenes that
 move."""
 
+LEAST_RECURRENCE = 0.5
+"""How well pixels agree with themselves a while later, over how well all agree with all: one under a lamp, zero where
+things go by."""
+
+RECURRENCE_SIGMAS = 4.8
+"""One-sided normal quantile of ``FALSE_ALARM``."""
+
 NEARLY = 0.5
 """Power of a line over that of the highest from which on the lower frequency is believed."""
 
@@ -56,15 +70,25 @@ class Flicker:
         return 1e6 / self.frequency_hz
 
 
-def find_flicker(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end_us: int) -> Flicker | None:
-    """Return the strongest line in the events of ``[begin_us, end_us)``, or ``None`` if there is none.
+def find_flicker(
+    t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end_us: int
+) -> Flicker | None:
+    """Return the lamp that the events of ``[begin_us, end_us)`` show, or ``None`` if there is none.
 
     Parameters
     ----------
-    t_us, on:
-        Times and polarities (1 or 0); order does not matter.
+    t_us, pixel, on:
+        Times, pixels' numbers and polarities (1 or 0); order does not matter.
 
     """
+    line = find_line(t_us, on, begin_us, end_us)
+    if line is None or not _recurs(t_us, pixel, on, 1e-6 * line.frequency_hz, (begin_us + end_us) // 2):
+        return None
+    return line
+
+
+def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end_us: int) -> Flicker | None:
+    """Return the strongest line in the difference of ON and OFF events, whatever makes it; else as ``find_flicker``."""
     bins = (end_us - begin_us) // BIN_US
     if bins < 8:
         return None
@@ -93,6 +117,33 @@ def find_flicker(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, 
     if false_alarm > FALSE_ALARM or share < LEAST_SHARE:
         return None
     return Flicker(_refined(frequencies, power, top), min(share, 1.0), false_alarm)
+
+
+def _recurs(
+    t_us: NDArray[np.int64],
+    pixel: NDArray[np.int64],
+    on: NDArray[np.uint8],
+    frequency_per_us: float,
+    middle_us: int,
+) -> bool:
+    """Say whether pixels do after *middle_us* what they did before it."""
+    turned = (2.0 * on - 1.0) * np.exp(-2j * np.pi * frequency_per_us * (t_us - middle_us))
+    before = t_us < middle_us
+    size = int(pixel.max()) + 1
+    swing, count = [], []
+    for half in (before, ~before):
+        where, what = pixel[half], turned[half]
+        swing.append(np.bincount(where, what.real, size) + 1j * np.bincount(where, what.imag, size))
+        count.append(np.bincount(where, minlength=size))
+    pairs, all_pairs = float(count[0] @ count[1]), float(count[0].sum()) * float(count[1].sum())
+    if pairs == 0.0:
+        return False
+    by_itself = float((swing[0] * swing[1].conj()).real.sum())
+    by_any = float((swing[0].sum() * swing[1].sum().conj()).real)
+    chance = float(np.sqrt(0.5 * np.square(np.abs(swing[0] * swing[1])).sum()))
+    if by_itself < RECURRENCE_SIGMAS * chance:
+        return False
+    return by_itself / pairs >= LEAST_RECURRENCE * by_any / all_pairs
 
 
 def _lowest_line(power: NDArray[np.float64]) -> int:

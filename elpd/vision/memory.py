@@ -54,8 +54,6 @@ class BuiltImage:
     levels: NDArray[np.float32]
     events: int
     """How many they were."""
-    pictured: bool = False
-    """Whether it began as a picture of the scene, and is one of it now; else it is a difference from what it was."""
 
 
 class EventMemory:
@@ -131,18 +129,18 @@ class EventMemory:
         """The image at the last ``advance``, (height, width) of the region and its margin, in thresholds: a view."""
         return self._energy.image
 
-    @property
-    def pictured(self) -> bool:
-        """Whether the image began as a picture of the scene."""
-        return self._start is not None and self._start.pictured
-
     def built(self) -> BuiltImage:
         """Return what all events so far have built, those after the last ``advance`` too."""
         levels = self._energy.image.copy()
         part = slice(self._taken, self._count)
         _, x, y, on = self._columns
         stamp_events(x[part], y[part], on[part], POINT, levels)
-        return BuiltImage(levels, self._forgotten + self._count, self.pictured)
+        return BuiltImage(levels, self._forgotten + self._count)
+
+    def change(self) -> NDArray[np.float32]:
+        """Return what the events of this memory alone have built, those after the last ``advance`` too."""
+        levels = self.built().levels
+        return levels if self._start is None else levels - self._start.levels
 
     def _make_room(self, count: int) -> None:
         """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""
@@ -187,8 +185,10 @@ class EventMemory:
         """Return a lamp's flicker, if the events show one."""
         if self._count == 0:
             return None
-        t_us, on = self._t_us, self._columns[3][: self._count]
-        return find_flicker(t_us, on, int(t_us[0]), int(t_us[-1]) + 1)
+        t_us = self._t_us
+        _, x, y, on = (column[: self._count] for column in self._columns)
+        pixel = y.astype(np.int64) * self._shape[1] + x
+        return find_flicker(t_us, pixel, on, int(t_us[0]), int(t_us[-1]) + 1)
 
     def advance(self, until_us: int, position: float) -> None:
         """Add a point to the curve of log S: the image that events before *until_us* built, the lens at *position*."""
@@ -226,12 +226,15 @@ class EventMemory:
         deaf_us: float = 0.0,
         start: NDArray[np.float32] | None = None,
         dark: float = DARK,
+        *,
+        hurried: bool = True,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
         show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
-        that the sensor saw when it sent the first of them. ``None`` when there is nothing to ask.
+        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
+        ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -262,6 +265,7 @@ class EventMemory:
             self._cut(start),
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
             dark,
+            hurried=hurried,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -277,9 +281,9 @@ class EventMemory:
         brightness: NDArray[np.float32] | None = None,
         start: NDArray[np.float32] | None = None,
     ) -> tuple[list[Witness], float | None]:
-        """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
+        """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start)
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None

@@ -4,6 +4,6 @@ Browsers speak HTTP to it on the loopback; it speaks to the daemon over the daem
 does. No part of the rig is imported here: whatever this process does, the worst that it can ask for is what the daemon
 allows its user. It has no state worth keeping but one token.
 
-``security`` says who may ask, ``relay`` shares one subscription among all tabs, ``commands`` carries requests to the
-daemon, ``pages`` serves the files, ``gateway`` puts them together.
+``door`` says how many may connect, ``security`` who may ask, ``relay`` shares one subscription among all tabs,
+``commands`` carries requests to the daemon, ``pages`` serves the files, ``gateway`` puts them together.
 """

@@ -27,6 +27,7 @@ from aiohttp import web
 from elpd.errors import ElpdError
 from elpd.web import pages
 from elpd.web.commands import COMMANDS, QUESTIONS, STATUS_OF, Desk, kind_of
+from elpd.web.door import has_asked, listening_on
 from elpd.web.relay import Relay
 from elpd.web.security import HEADERS, Gate
 
@@ -39,7 +40,13 @@ BODY_LIMIT_BYTES = 16 << 10
 MAX_TABS = 24
 BATCH_EVERY_S = 1 / 30
 STILL_HERE_S = 10.0
+STALLED_S = 30.0
+"""A tab that takes nothing for so long loses its place; it comes back by itself."""
+BODY_WITHIN_S = 5.0
+PATH_LETTERS = 200
 PICTURE_TYPES = {"jpeg": "image/jpeg", "png": "image/png", "png16": "image/png"}
+TAB_HEADER, TAB_LETTERS = "X-Elpd-Tab", 64
+"""Which tab asks, a word of its own choice: the lease is one tab's."""
 NUMBERS = frozenset({"limit", "max_width"})
 """Query fields that are whole numbers; the others are words."""
 
@@ -68,13 +75,8 @@ def build_app(daemon: Path, gate: Gate) -> web.Application:
 
 async def serve(app: web.Application, listening: socket.socket) -> None:
     """Serve on an open socket until cancelled."""
-    runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
-    await runner.setup()
-    try:
-        await web.SockSite(runner, listening).start()
+    async with listening_on(app, listening):
         await asyncio.Event().wait()
-    finally:
-        await runner.cleanup()
 
 
 @web.middleware
@@ -82,9 +84,11 @@ async def _judge(
     request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
 ) -> web.StreamResponse:
     """Let in or refuse; give every error one form."""
+    has_asked(request)
     refusal = request.app[GATE].judge(request.method, request.path, request.headers)
     if refusal is not None:
-        log.warning("refused", status=refusal.status, method=request.method, path=request.path)
+        asked = request.raw_path.partition("?")[0][:PATH_LETTERS]  # raw: no letter that a terminal would obey
+        log.warning("refused", status=refusal.status, method=request.method, path=asked)
         return _error(refusal.status, "Refused", refusal.message)
     try:
         return await handler(request)
@@ -114,13 +118,22 @@ async def _command(request: web.Request) -> web.StreamResponse:
     if method not in COMMANDS:
         return _error(404, "UsageError", f"there is no command {method!r}; there are {', '.join(sorted(COMMANDS))}")
     try:
-        params = await request.json()
+        async with asyncio.timeout(BODY_WITHIN_S):
+            body = await request.read()
+    except TimeoutError:
+        return _error(408, "UsageError", f"the body did not come within {BODY_WITHIN_S:g} s")
+    except web.RequestPayloadError:
+        return _error(400, "UsageError", "the body is broken")
+    try:
+        params = json.loads(body)  # UTF-8, whatever the head says
     except (ValueError, RecursionError):
         return _error(400, "UsageError", "the body is not JSON")
     if not isinstance(params, dict):
         return _error(400, "UsageError", "the body is not a JSON object")
-    answer = await request.app[DESK].command(method, params)
-    log.info("command", method=method, params=params)
+    tab = request.headers.get(TAB_HEADER, "")[:TAB_LETTERS]
+    answer = await request.app[DESK].command(method, params, tab)
+    if params.get("action") != "renew":  # every few seconds, and nothing new
+        log.info("command", method=method, params=params)
     return web.json_response(answer)
 
 
@@ -171,8 +184,13 @@ async def _events(request: web.Request) -> web.StreamResponse:
                     batch = await tab.batch()
             except TimeoutError:
                 batch = b": still here\n\n"
-            await response.write(batch)
+            async with asyncio.timeout(STALLED_S):
+                await response.write(batch)
             await asyncio.sleep(BATCH_EVERY_S)
+    except TimeoutError:
+        if request.transport is not None:
+            request.transport.abort()  # whatever is said to it would wait behind what it has not taken
+        return response
     except (ConnectionError, asyncio.CancelledError):  # the tab was closed, or the gateway is
         return response
     finally:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import secrets
 from collections import deque
 from contextlib import aclosing
@@ -118,7 +119,8 @@ class Relay:
                     hello = await client.hello()
                     retry_s = RETRY_FIRST_S
                     self._in_cycle = False
-                    self._tell_link({"connected": True, "role": hello["role"], "version": hello["version"]})
+                    told = {"role": hello["role"], "version": hello["version"], "pid": os.getpid()}
+                    self._tell_link({"connected": True, **told})
                     await _until_one_fails(self._listen(client), self._watch(client))
                 except ElpdError as error:
                     self._tell_link({"connected": False, "reason": str(error), "retry_s": retry_s})

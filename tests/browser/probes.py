@@ -31,14 +31,29 @@ PALE = """() => {
     return [255, 255, 255];
   };
   const pale = {};
-  for (const element of document.querySelectorAll("h2, p, label, dt, dd, button:enabled, summary, .link, .state")) {
-    if (!element.checkVisibility() || !element.textContent.trim() || element.closest(".stage")) continue;
-    const both = [light(numbers(getComputedStyle(element).color)), light(ground(element))].sort((a, b) => b - a);
+  const look = (element, colour, text) => {
+    const both = [light(numbers(colour)), light(ground(element))].sort((a, b) => b - a);
     const ratio = (both[0] + 0.05) / (both[1] + 0.05);
-    if (ratio < 4.5) pale[element.id || element.textContent.trim().slice(0, 30)] = ratio.toFixed(2);
+    if (ratio < 4.5) pale[element.id || text.slice(0, 30)] = ratio.toFixed(2);
+  };
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const [element, text] = [walk.currentNode.parentElement, walk.currentNode.data.trim()];
+    const off = element.closest(":disabled, .stage, noscript, select") || element.previousElementSibling?.disabled;
+    if (text && !off && element.checkVisibility()) look(element, getComputedStyle(element).color, text);
   }
+  for (const field of document.querySelectorAll("input:enabled[placeholder]"))
+    if (field.checkVisibility()) look(field, getComputedStyle(field, "::placeholder").color, field.placeholder);
   return pale;
 }"""
-"""Texts whose contrast is below 4.5 (WCAG 2, AA), with it."""
+"""Texts whose contrast is below 4.5 (WCAG 2, AA), with it; what is disabled is left out, as there."""
 
 MOVING = "document.getAnimations().filter((one) => one.playState === 'running').length"
+
+TOUCHES = """() => {
+  window.touches = [];
+  addEventListener("touchstart", ({ target, defaultPrevented }) => {
+    window.touches.push([target.closest("button, #region").id, defaultPrevented]);
+  });
+}"""
+"""Every touch: where, and whether the page kept it from being a gesture of the browser's."""

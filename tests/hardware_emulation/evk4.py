@@ -10,6 +10,8 @@ import struct
 import threading
 from collections import deque
 
+from hardware_emulation.wire import Outbox, described, descriptors
+
 VENDOR, PRODUCT = 0x04B4, 0x00F5
 CONTROL_OUT, CONTROL_IN, EVENTS_IN = 0x02, 0x82, 0x81
 _SERIAL, _RELEASE, _BUILD, _DEVICES, _NAME, _COMPATIBLE = 0x72, 0x79, 0x7A, 0x10000, 0x10001, 0x10003
@@ -18,21 +20,7 @@ _ADC_STATUS, _ADC_DONE = 0x50, 1 << 11
 _TIME_BASE, _ROI_CONTROL, _OUT_OF_RESET = 0x9008, 0x4, 1 << 10
 ROI_X, ROI_Y, DIGITAL_MASK = 0x2000, 0x4000, 0x9100
 RATE_ENABLE, RATE_EVENTS, BIAS_DIFF_ON = 0x6028, 0x600C, 0x1010
-
-
-def _string(text: str) -> bytes:
-    content = text.encode("utf-16-le")
-    return bytes((len(content) + 2, 3)) + content
-
-
-def _descriptors() -> bytes:
-    device = struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0300, 0, 0, 0, 9, VENDOR, PRODUCT, 0x100, 1, 2, 0, 1)
-    endpoints = b"".join(
-        struct.pack("<BBBBHB", 7, 5, endpoint, 2, 1024, 0) + struct.pack("<BBBBH", 6, 48, 15, 0, 0)
-        for endpoint in (EVENTS_IN, CONTROL_IN, CONTROL_OUT)
-    )
-    interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 3, 0xFF, 0, 0, 0) + endpoints
-    return device + struct.pack("<BBHBBBBB", 9, 2, 9 + len(interface), 1, 1, 0, 0x80, 50) + interface
+_PIPELINE, _TRIGGER = 0x7004, 1 << 10
 
 
 class Evk4:
@@ -42,7 +30,7 @@ class Evk4:
     streaming_endpoints = frozenset({EVENTS_IN})
 
     def __init__(self, serial: str = "00050567") -> None:
-        self.descriptors = _descriptors()
+        self.descriptors = descriptors(VENDOR, PRODUCT, 0x100, (EVENTS_IN, CONTROL_IN, CONTROL_OUT))
         self.attributes = {"manufacturer": "Prophesee", "product": "EVK4", "serial": serial}
         self.registers: dict[int, int] = {}
         self.writes = 0
@@ -52,15 +40,15 @@ class Evk4:
         self._answer_then = False
         self._serial = bytes.fromhex(serial)[::-1]
         self._replies: deque[bytes] = deque()
-        self._stream: deque[bytes | None] = deque()
+        self._stream = Outbox()
 
     def send(self, packet: bytes) -> None:
         """Queue a USB packet of events; one that is longer than the host asks for goes in several."""
-        self._stream.append(packet)
+        self._stream.put(packet)
 
     def stall(self) -> None:
         """Let the next request for events fail, as an endpoint does that has lost its way."""
-        self._stream.appendleft(None)
+        self._stream.stall()
 
     def answer_when_sent(self) -> None:
         """Answer frames again once the host has taken every packet of events."""
@@ -70,6 +58,11 @@ class Evk4:
     def streaming(self) -> bool:
         """Whether the host has started the sensor: its clock runs and its pixels are not held in reset."""
         return bool(self.registers.get(_TIME_BASE, 0) & 1 and self.registers.get(_ROI_CONTROL, 0) & _OUT_OF_RESET)
+
+    @property
+    def listening(self) -> bool:
+        """Whether edges on the trigger input come between the events."""
+        return bool(self.registers.get(_PIPELINE, 0) & _TRIGGER)
 
     @property
     def unsent(self) -> int:
@@ -83,13 +76,7 @@ class Evk4:
         if (kind, request) == (0xC0, 0x72):
             return b"\x31\x00"
         if (kind, request) == (0x80, 0x06):
-            answer = {
-                0x0300: b"\x04\x03\x09\x04",
-                0x0301: _string("Prophesee"),
-                0x0302: _string("EVK4"),
-                0x0100: self.descriptors[:18],
-                0x0200: self.descriptors[18:],
-            }.get(value)
+            answer = described(self.descriptors, ("Prophesee", "EVK4"), value)
             return None if answer is None else answer[:length]
         return b"" if not kind & 0x80 else None
 
@@ -107,14 +94,7 @@ class Evk4:
             self.answering.set()
         if endpoint == CONTROL_IN:
             return self._replies.popleft() if self._replies and self.answering.is_set() else None
-        if not self._stream or not self.streaming:
-            return None
-        packet = self._stream.popleft()
-        if packet is None:
-            raise BrokenPipeError
-        if len(packet) > length:
-            self._stream.appendleft(packet[length:])
-        return packet[:length]
+        return self._stream.take(length) if self.streaming else None
 
     def _answer(self, command: int, payload: bytes) -> bytes:
         if command == _REGISTER | _WRITE:

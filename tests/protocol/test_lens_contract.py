@@ -360,18 +360,11 @@ def test_an_adapter_that_keeps_replies_back_makes_positions_vaguer_not_wrong(kin
     assert made.lens.remarks == ()
 
 
-@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
-@pytest.mark.parametrize("side", ["before a read", "after a read", "before a write", "after a write"])
-@pytest.mark.parametrize("seed", [1, 2, 15])
-def test_a_thread_that_is_put_aside_beside_the_port_loses_no_position(kind: str, side: str, seed: int) -> None:
-    """On a busy machine the scheduler takes hundreds of milliseconds between two lines of any program."""
-    made = open_rig(kind)
-    made.live(20)
-    draw = Random(seed)
-    when, _, what = side.rsplit(" ", 2)
+def put_aside_beside_the_port(made: Rig, side: str, seed: int) -> None:
+    """Let 20 to 400 ms pass, one time in ten, "before" or "after" each "read" or "write"."""
+    draw, awake_until = Random(seed), made.soon(0)
+    when, what = side.split()
     port_does = made.port.read_available if what == "read" else made.port.write
-
-    awake_until = made.soon(0)
 
     def put_aside() -> None:
         nonlocal awake_until
@@ -388,6 +381,16 @@ def test_a_thread_that_is_put_aside_beside_the_port_loses_no_position(kind: str,
         return done
 
     setattr(made.port, "read_available" if what == "read" else "write", beside)
+
+
+@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
+@pytest.mark.parametrize("side", ["before read", "after read", "before write", "after write"])
+@pytest.mark.parametrize("seed", [1, 2, 15])
+def test_a_thread_that_is_put_aside_beside_the_port_loses_no_position(kind: str, side: str, seed: int) -> None:
+    """On a busy machine the scheduler takes hundreds of milliseconds between two lines of any program."""
+    made = open_rig(kind)
+    made.live(20)
+    put_aside_beside_the_port(made, side, seed)
     for velocity in (SPEED_SPS / 8, -SPEED_SPS / 8, SPEED_SPS / 8):
         made.lens.run(velocity, made.soon(1500))
         made.live(600)
@@ -397,6 +400,16 @@ def test_a_thread_that_is_put_aside_beside_the_port_loses_no_position(kind: str,
     estimate = made.lens.position_at(made.clock.now_ns())
     assert estimate.sigma_steps < 1.5
     assert estimate.steps == pytest.approx(made.rotor, abs=4 * estimate.sigma_steps)
+
+
+@pytest.mark.parametrize("side", ["before read", "after read", "before write", "after write"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_thread_that_is_put_aside_beside_the_port_homes_all_the_same(kind: str, side: str, seed: int) -> None:
+    made = open_rig(kind)
+    put_aside_beside_the_port(made, side, seed)
+    report = made.lens.home(made.soon(60_000))
+    assert LensFlag.REFERENCED in report.flags
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=3.2)
 
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from engines import SOMEBODY, Daemon
 
-from elpd.service.threads import FOCUS_LIMIT_S, Supervisor
+from elpd.service.threads import FOCUS_LIMIT_S, FORGOTTEN_AFTER_LOOKS, Supervisor
+from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -160,7 +162,7 @@ def test_a_focus_thread_that_hangs_has_its_lens_stopped_and_no_watchdog_fed(tmp_
     beats._now_s = lambda: clock[0]
     beats.expect("focus", FOCUS_LIMIT_S)
     notifier = FakeNotifier()
-    supervisor = Supervisor(daemon.engine, notifier)  # type: ignore[arg-type]
+    supervisor = Supervisor(daemon.engine, notifier, lambda: 0.0)  # type: ignore[arg-type]
     supervisor.look()
     assert notifier.fed == 1
     asked = daemon.ask("move", fraction=1.0)
@@ -190,9 +192,63 @@ def test_a_focus_thread_that_is_slow_while_nothing_is_done_is_no_fault(tmp_path:
     daemon.engine.heartbeats.expect("focus", FOCUS_LIMIT_S)
     notifier = FakeNotifier()
     clock[0] += FOCUS_LIMIT_S + 0.1
-    Supervisor(daemon.engine, notifier).look()  # type: ignore[arg-type]
+    Supervisor(daemon.engine, notifier, lambda: 0.0).look()  # type: ignore[arg-type]
     assert notifier.fed == 0
     assert daemon.status.state == "READY"
+
+
+def test_a_starved_machine_is_no_hang(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path).begin()
+    clock, in_line = [100.0], [0.0]
+    beats = daemon.engine.heartbeats
+    beats._now_s = lambda: clock[0]
+    beats.expect("focus", FOCUS_LIMIT_S)
+    notifier = FakeNotifier()
+    supervisor = Supervisor(daemon.engine, notifier, lambda: in_line[0])  # type: ignore[arg-type]
+    supervisor.look()
+    asked = daemon.ask("move", fraction=1.0)
+    assert daemon.engine.place.take() is asked.job
+    daemon.parts.lens.run(2000.0, daemon.truth.world.now_ns() + 2_000_000_000)
+    daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 20_000_000)
+    clock[0] += FOCUS_LIMIT_S + 0.5
+    in_line[0] += FOCUS_LIMIT_S
+    supervisor.look()
+    assert notifier.fed == 2, "nobody ends a process for what the machine does"
+    assert daemon.status.fault is None
+    assert [one.code for one in daemon.status.warnings] == ["overloaded"]
+    assert not asked.job.cancelled
+    assert daemon.velocity != 0.0, "this lens's time stands still while nobody computes it"
+    clock[0] += 1.0
+    supervisor.look()
+    assert daemon.status.fault is not None, "the second that followed was its own"
+    assert daemon.status.fault.kind == "Hang"
+    beats.beat("focus")
+    for _ in range(FORGOTTEN_AFTER_LOOKS):
+        supervisor.look()
+    assert not daemon.status.warnings
+
+
+def test_a_lens_that_moves_by_itself_is_stopped_on_a_starved_machine(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path).begin()
+    clock, in_line = [100.0], [0.0]
+    daemon.engine.heartbeats._now_s = lambda: clock[0]
+    daemon.engine.heartbeats.expect("focus", FOCUS_LIMIT_S)
+    supervisor = Supervisor(daemon.engine, FakeNotifier(), lambda: in_line[0])  # type: ignore[arg-type]
+    supervisor.look()
+    asked = daemon.ask("move", fraction=1.0)
+    assert daemon.engine.place.take() is asked.job
+    daemon.parts.lens.run(2000.0, daemon.truth.world.now_ns() + 2_000_000_000)
+    daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 20_000_000)
+    assert daemon.engine.keeper.parts is not None
+    daemon.engine.keeper.parts = replace(daemon.engine.keeper.parts, clock=MonotonicClock())
+    clock[0] += FOCUS_LIMIT_S + 0.5
+    in_line[0] += FOCUS_LIMIT_S
+    supervisor.look()
+    daemon.truth.world.sleep_until(daemon.truth.world.now_ns() + 10_000_000)
+    assert daemon.velocity == 0.0
+    assert daemon.status.fault is None
+    assert asked.job.cancelled
+    assert "overloaded" in (asked.job.why_cancelled or "")
 
 
 class FakeNotifier:

@@ -11,7 +11,7 @@ from elpd_drivers.cameras.ring import Captured, RingMemory, RingReader, RingWrit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elpd.records import Frame, Trigger
+from elpd.records import Frame, ImuSample, Trigger
 from elpd.units import SensorUs
 
 if TYPE_CHECKING:
@@ -52,7 +52,11 @@ def test_everything_a_packet_says_arrives(pair: Pair) -> None:
         Frame(SensorUs(5), SensorUs(6), 7, np.arange(15, dtype=kind).reshape(3, 5)) for kind in (np.uint8, np.uint16)
     )
     edges = (Trigger(SensorUs(-3), 6, rising=True), Trigger(SensorUs(1 << 40), 0, rising=False))
-    sent = Captured(b"words", 11, 12, 13, frames, edges, gap_before=True, lost_events=14, backlog=15)
+    samples = (
+        ImuSample(SensorUs(-7), (1.5, -2.25, 9.75), (0.125, 0.0, -0.5), 30.5),
+        ImuSample(SensorUs(9), (0.0, 0.0, 0.0), (1e-3, 2e-3, 3e-3), -4.0),
+    )
+    sent = Captured(b"words", 11, 12, 13, frames, edges, gap_before=True, lost_events=14, backlog=15, imu=samples)
     assert pair.writer.publish(sent, generation=16)
     taken = pair.reader.take()
     assert taken is not None
@@ -60,6 +64,7 @@ def test_everything_a_packet_says_arrives(pair: Pair) -> None:
     assert (taken.received_ns, taken.complete_until_us, taken.events, taken.generation) == (11, 12, 13, 16)
     assert (taken.gap_before, taken.lost_events, taken.backlog) == (True, 14, 15)
     assert taken.triggers == edges
+    assert taken.imu == samples
     for frame, was in zip(taken.frames, frames, strict=True):
         assert (frame.t_us, frame.available_us, frame.exposure_us) == (5, 6, 7)
         assert frame.pixels.dtype == was.pixels.dtype

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from command_line import Answer, caller
+from elpd_drivers.formats.aedat4 import FORMAT as AEDAT4
 from elpd_drivers.formats.raw import FORMAT as RAW
-from event_files import GEOMETRY, edge, many, packet, peak_bytes, read_all
+from event_files import GEOMETRY, edge, many, packet, peak_bytes, read_all, read_imu, sample
 from shared import RECORDINGS, needs_shared
 
 from elpd.cli.decode import summarise
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FIELDS = {
-    *("out", "format", "width", "height", "events", "on", "first_us", "last_us", "triggers", "frames", "shift_us"),
-    *("lost", "lost_reason", "warnings"),
+    *("out", "format", "width", "height", "events", "on", "first_us", "last_us", "triggers", "frames", "imu"),
+    *("shift_us", "lost", "lost_reason", "warnings"),
 }
 EDGES = [edge(9000, 1), edge(12_000, 1, rising=False)]
 COLUMNS = [column.tolist() for column in many(1000)]
@@ -85,6 +86,20 @@ def test_a_cameras_own_words_stay_and_are_named_where_they_cannot(tmp_path: Path
     assert (same["lost"], same["warnings"]) == (5, ["the file holds no events"])
     other = convert(tmp_path / "in.raw", tmp_path / "other.raw", word="evt2")
     assert "not carried over: the rate controller's counts, 1 words of the camera about itself" in other["warnings"]
+
+
+def test_inertial_samples_are_carried_cut_and_named_where_they_cannot_be(tmp_path: Path) -> None:
+    samples = [sample(5000 + 1000 * k, k) for k in range(5)]
+    with closing(AEDAT4.create(tmp_path / "in.aedat4", "aedat4", GEOMETRY, {})) as writer:
+        writer.write(packet(many(300), imu=samples))
+    whole = convert(tmp_path / "in.aedat4", tmp_path / "whole.aedat4")
+    assert (whole["imu"], whole["warnings"]) == (5, [])
+    assert read_imu(tmp_path / "whole.aedat4") == read_imu(tmp_path / "in.aedat4")
+    part = convert(tmp_path / "in.aedat4", tmp_path / "part.aedat4", part=Slice(None, 6000, 8000))
+    assert part["imu"] == 2
+    assert [one.t_us for one in read_imu(tmp_path / "part.aedat4")] == [6000, 7000]
+    other = convert(tmp_path / "in.aedat4", tmp_path / "out.csv")
+    assert (other["imu"], other["warnings"]) == (0, ["not carried over: 5 IMU samples"])
 
 
 def test_times_that_do_not_fit_are_moved_by_whole_seconds(tmp_path: Path) -> None:

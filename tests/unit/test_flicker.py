@@ -6,16 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elpd.records import Geometry, Roi
-from elpd.vision.flicker import FALSE_ALARM, find_flicker, residue
+from elpd.vision.flicker import FALSE_ALARM, find_flicker, find_line, residue
 from elpd.vision.resting import Resting, hot_pixels
 from elpd.vision.whole_periods import WholePeriods
 
 SPAN_US = 48_000
 
 
-def noise(seed: int, count: int, bias: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+def noise(seed: int, count: int, bias: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return np.sort(rng.integers(0, SPAN_US, count)), (rng.random(count) < bias).astype(np.uint8)
+    t, on = np.sort(rng.integers(0, SPAN_US, count)), (rng.random(count) < bias).astype(np.uint8)
+    return t, rng.integers(0, 500, count), on
 
 
 def lamp(hz: float, seed: int = 0, pixels: int = 500, depth: float = 3.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,30 +37,64 @@ def test_noise_is_not_taken_for_a_lamp(bias: float) -> None:
 
 
 def test_scarce_events_say_nothing() -> None:
-    t, _, on = lamp(100.0, pixels=2, depth=1.0)
-    assert find_flicker(t[:10], on[:10], 0, SPAN_US) is None
-    assert find_flicker(t, on, 0, 1000) is None
+    t, pixel, on = lamp(100.0, pixels=2, depth=1.0)
+    assert find_flicker(t[:10], pixel[:10], on[:10], 0, SPAN_US) is None
+    assert find_flicker(t, pixel, on, 0, 1000) is None
 
 
 @pytest.mark.parametrize("hz", [90.0, 100.0, 120.0, 240.0, 700.0])
 def test_a_lamp_is_found_and_its_frequency_measured(hz: float) -> None:
-    t, _, on = lamp(hz)
-    found = find_flicker(t, on, 0, SPAN_US)
+    t, pixel, on = lamp(hz)
+    found = find_flicker(t, pixel, on, 0, SPAN_US)
     assert found is not None
     assert found.frequency_hz == pytest.approx(hz, rel=2e-3)
     assert found.share > 0.8
 
 
 def test_a_lamp_is_found_among_other_events_but_not_when_they_are_most() -> None:
-    t, _, on = lamp(100.0)
-    few, many = noise(1, t.size), noise(1, 20 * t.size)
-    assert find_flicker(np.concatenate([t, few[0]]), np.concatenate([on, few[1]]), 0, SPAN_US) is not None
-    assert find_flicker(np.concatenate([t, many[0]]), np.concatenate([on, many[1]]), 0, SPAN_US) is None
+    swinging = lamp(100.0)
+    few, many = (
+        tuple(np.concatenate(two) for two in zip(swinging, noise(1, times * swinging[0].size), strict=True))
+        for times in (1, 20)
+    )
+    assert find_flicker(*few, 0, SPAN_US) is not None
+    assert find_flicker(*many, 0, SPAN_US) is None
+
+
+def passing(columns: int, hz: float, rows: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A square, bright on its way in and dark on its way out, whose edges enter a new column *hz* times a second."""
+    into = np.repeat(np.arange(columns), rows)
+    t_us = np.rint(1e6 / hz * into).astype(np.int64) + np.tile(np.arange(rows), columns)
+    pixel = np.tile(np.arange(rows), columns) * 200 + into
+    kept = t_us < SPAN_US
+    return t_us[kept], pixel[kept], np.ones(int(kept.sum()), np.uint8)
+
+
+def test_an_edge_that_goes_from_column_to_column_makes_a_line_but_is_no_lamp() -> None:
+    front, noisy = passing(15, 300.0), noise(3, 600)
+    rear = front[0] + 1_500, front[1] + 30, 1 - front[2]
+    t, pixel, on = (np.concatenate(columns) for columns in zip(front, rear, noisy, strict=True))
+    line = find_line(t, on, 0, SPAN_US)
+    assert line is not None
+    assert line.frequency_hz == pytest.approx(300.0, rel=0.01)
+    assert find_flicker(t, pixel, on, 0, SPAN_US) is None
+
+
+def test_pixels_that_are_all_left_behind_by_the_middle_show_no_lamp() -> None:
+    t, pixel, on = lamp(100.0)
+    pixel = np.where(t < SPAN_US // 2, pixel, pixel + 500)
+    assert find_line(t, on, 0, SPAN_US) is not None
+    assert find_flicker(t, pixel, on, 0, SPAN_US) is None
+
+
+def test_a_lamp_is_found_although_an_edge_goes_by() -> None:
+    t, pixel, on = (np.concatenate(two) for two in zip(lamp(100.0), passing(15, 300.0), strict=True))
+    assert find_flicker(t, pixel, on, 0, SPAN_US) is not None
 
 
 def test_whole_periods_of_pixels_that_follow_leave_nothing_and_others_are_seen() -> None:
     t, pixel, on = lamp(100.0)
-    found = find_flicker(t, on, 0, SPAN_US)
+    found = find_flicker(t, pixel, on, 0, SPAN_US)
     assert found is not None
     assert residue(t, pixel, on, found, SPAN_US) < 1.0
     deaf = on.astype(bool) | (np.random.default_rng(1).random(on.size) < 0.5)

@@ -1,6 +1,7 @@
 """AEDAT4: events, frames and edges there and back, other people's readers and writers, and damage."""
 
 import datetime as dt
+import math
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,18 @@ import pytest
 from elpd_drivers.formats import aedat4_write
 from elpd_drivers.formats.aedat4 import FORMAT
 from elpd_drivers.formats.aedat4_header import MAGIC
-from event_files import GEOMETRY, edge, event_columns, many, packet, peak_bytes, read_all, write_all
+from event_files import (
+    GEOMETRY,
+    edge,
+    event_columns,
+    many,
+    packet,
+    peak_bytes,
+    read_all,
+    read_imu,
+    sample,
+    write_all,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import RECORDINGS, needs_shared
@@ -24,6 +36,7 @@ from elpd.units import SensorUs
 
 DAVIS = RECORDINGS / "davis346_frames_events.aedat4"
 DIGESTS = ["f1e093cad5af", "1d8ea97b0feb", "18f89da35f8f", "6f99cf01187d"]
+SAMPLES = [sample(5010 + 1000 * k, k) for k in range(5)]
 EDGES = [edge(5010, 0), edge(5020, 0, rising=False), edge(5030, 1), edge(5040, 2), edge(5050, 3, rising=False)]
 
 
@@ -41,7 +54,7 @@ def create(path: Path) -> aedat4_write.Aedat4Writer:
 def small(tmp_path: Path) -> Path:
     path = tmp_path / "r.aedat4"
     with closing(create(path)) as writer:
-        writer.write(packet(many(300), triggers=EDGES, frames=[frame(6000)]))
+        writer.write(packet(many(300), triggers=EDGES, frames=[frame(6000)], imu=SAMPLES))
         writer.write(packet([column[:0] for column in many(1)], frames=[frame(26_000, 1)]))
     return path
 
@@ -67,6 +80,15 @@ def test_edges_and_frames_come_back_with_their_times(small: Path) -> None:
         assert (found.available_us, found.exposure_us) == (wanted.available_us, wanted.exposure_us)
         assert (found.pixels == wanted.pixels).all()
     assert [found.t_us for found in frames] == [6000, 26_000]
+
+
+def test_inertial_samples_come_back_in_our_units(small: Path) -> None:
+    found = read_imu(small)
+    assert [one.t_us for one in found] == [one.t_us for one in SAMPLES]
+    for one, wanted in zip(found, SAMPLES, strict=True):
+        assert one.acceleration_m_s2 == pytest.approx(wanted.acceleration_m_s2, rel=1e-6)
+        assert one.rotation_rad_s == pytest.approx(wanted.rotation_rad_s, rel=1e-6)
+        assert one.temperature_c == 30.5
 
 
 def test_what_was_changed_or_left_out_is_told(tmp_path: Path) -> None:
@@ -167,6 +189,10 @@ def test_the_aedat_package_reads_what_we_write(small: Path) -> None:
     for ours, name in zip(many(300), ("t", "x", "y", "on"), strict=True):
         assert (ours == events[name]).all()
     assert [one["source"] for one in np.concatenate(found["triggers"])] == [1, 2, 4, 6, 9]
+    (inertial,) = found["imus"]
+    assert inertial["t"].tolist() == [one.t_us for one in SAMPLES]
+    assert inertial["accelerometer_x"].tolist() == pytest.approx([g(one.acceleration_m_s2[0]) for one in SAMPLES])
+    assert inertial["gyroscope_z"].tolist() == pytest.approx([math.degrees(one.rotation_rad_s[2]) for one in SAMPLES])
     theirs = found["frame"][0]
     assert (theirs["exposure_begin_t"], theirs["exposure_end_t"], theirs["end_t"]) == (5750, 6250, 15_000)
     assert (theirs["pixels"] == frame(6000).pixels).all()
@@ -183,6 +209,16 @@ def test_dv_processing_reads_what_we_write(small: Path) -> None:
     assert (theirs.exposure, theirs.timestamp) == (dt.timedelta(microseconds=500), 5750)
     assert (theirs.image == frame(6000).pixels).all()
     assert [one.timestamp for one in recording.getNextTriggerBatch()] == [one.t_us for one in EDGES]
+    inertial = recording.getNextImuBatch()
+    assert [one.timestamp for one in inertial] == [one.t_us for one in SAMPLES]
+    assert [one.temperature for one in inertial] == [30.5] * 5
+    for one, wanted in zip(inertial, SAMPLES, strict=True):
+        assert one.accelerometerY == pytest.approx(g(wanted.acceleration_m_s2[1]))
+        assert one.gyroscopeX == pytest.approx(math.degrees(wanted.rotation_rad_s[0]))
+
+
+def g(acceleration_m_s2: float) -> float:
+    return acceleration_m_s2 / 9.80665
 
 
 def write_with_dv(dv: Any, path: Path, compression: str) -> None:
@@ -190,6 +226,7 @@ def write_with_dv(dv: Any, path: Path, compression: str) -> None:
     config.addEventStream((64, 48))
     config.addFrameStream((64, 48))
     config.addTriggerStream()
+    config.addImuStream()
     writer = dv.io.MonoCameraWriter(str(path), config)
     store = dv.EventStore()
     for t, x, y, p in zip(*(column.tolist() for column in many(300)), strict=True):
@@ -201,6 +238,7 @@ def write_with_dv(dv: Any, path: Path, compression: str) -> None:
     colours = dv.Frame(7750, np.full((48, 64, 3), 90, np.uint8))
     writer.writeFrame(colours)
     writer.writeTrigger(dv.Trigger(5010, dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE))
+    writer.writeImu(dv.IMU(5020, 31.0, 0.0, 0.0, 1.0, 180.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     del writer
 
 
@@ -218,6 +256,10 @@ def test_what_dv_processing_writes_is_read(tmp_path: Path, compression: str) -> 
     ]
     assert (frames[0].pixels == frame(6000).pixels).all()
     assert (frames[1].pixels == 90).all()
+    (inertial,) = read_imu(path)
+    assert (inertial.t_us, inertial.temperature_c) == (5020, 31.0)
+    assert inertial.acceleration_m_s2 == (0.0, 0.0, 9.80665)
+    assert inertial.rotation_rad_s == pytest.approx((math.pi, 0.0, 0.0))
 
 
 # --- a real one --------------------------------------------------------------------------------------------------
@@ -232,6 +274,22 @@ def test_the_digests_are_those_of_the_field() -> None:
         *(78_830, 59, 2363, 346, 260, 0, [])
     ]
     assert len(summary["triggers"]) == 236
+
+
+@needs_shared
+def test_the_aedat_package_agrees_on_every_inertial_sample() -> None:
+    aedat = pytest.importorskip("aedat")
+    theirs = np.concatenate([one["imus"] for one in aedat.Decoder(DAVIS) if "imus" in one])
+    ours = read_imu(DAVIS)
+    assert len(ours) == len(theirs) == 2363
+    assert [one.t_us for one in ours] == theirs["t"].tolist()
+    assert [one.temperature_c for one in ours] == theirs["temperature"].tolist()
+    for place, axis in enumerate("xyz"):
+        assert [g(one.acceleration_m_s2[place]) for one in ours] == pytest.approx(theirs[f"accelerometer_{axis}"])
+        turned = [math.degrees(one.rotation_rad_s[place]) for one in ours]
+        assert turned == pytest.approx(theirs[f"gyroscope_{axis}"], abs=1e-6)
+    length = np.linalg.norm([one.acceleration_m_s2 for one in ours], axis=1)
+    assert 9.3 < np.median(length) < 10.3, "a camera that hardly moves feels gravity"
 
 
 @needs_shared

@@ -136,6 +136,9 @@ def test_a_real_davis_recording_is_played_with_its_frames() -> None:
     assert all(one.encoding is Encoding.ARRAY for one, _ in found)
     times = [one.available_us for one in frames]
     assert times == sorted(times)
+    inertial = [(each.complete_until_us, one.t_us) for each, _ in found for one in each.imu]
+    assert len(inertial) == 2363
+    assert all(until is None or t_us < until for until, t_us in inertial), "none comes before its packet's time"
 
 
 @needs_shared

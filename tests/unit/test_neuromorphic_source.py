@@ -14,7 +14,8 @@ from elpd_drivers.cameras.neuromorphic import NeuromorphicSource
 from elpd_drivers.cameras.neuromorphic_tables import NeuromorphicSettings
 
 from elpd.errors import CameraError, ConfigError
-from elpd.records import Encoding, Geometry
+from elpd.records import Encoding, Geometry, ImuSample
+from elpd.units import SensorUs
 
 nd = pytest.importorskip("neuromorphic_drivers")
 
@@ -55,6 +56,7 @@ class Device:
             **{
                 "polarity_events": None,
                 "trigger_events": None,
+                "imu_events": None,
                 "frames": [],
                 "polarity_events_overflow_indices": None,
                 "trigger_events_overflow_indices": None,
@@ -86,7 +88,7 @@ def events(*times: int) -> Any:
 
 def test_the_library_names_fields_as_we_know_them() -> None:
     """The stand-in's packets have the fields of the real ones."""
-    for name in ("polarity_events", "trigger_events", "frames", "polarity_events_overflow_indices"):
+    for name in ("polarity_events", "trigger_events", "imu_events", "frames", "polarity_events_overflow_indices"):
         assert name in nd.Davis346Packet.__annotations__
     for name in ("start_t", "exposure_start_t", "exposure_end_t", "t", "pixels"):
         assert name in nd.Frame.__annotations__
@@ -108,7 +110,7 @@ def test_arrays_frames_and_edges_of_a_davis346() -> None:
     )
     opened = source(device)
     assert (opened.facts.encoding, opened.facts.geometry) == (Encoding.ARRAY, Geometry(346, 260))
-    assert opened.facts.abilities == ("window", "biases", "mask")
+    assert opened.facts.abilities == ("biases", "mask", "imu")
     packet = opened.read(0.0)
     assert packet is not None
     assert (packet.events, packet.complete_until_us, packet.backlog, packet.gap_before) == (2, 1234, 2, False)
@@ -131,30 +133,39 @@ def test_arrays_frames_and_edges_of_a_davis346() -> None:
     assert device.closed == 1
 
 
-def test_a_davis346_takes_windows_masks_and_biases() -> None:
+def test_a_davis346_takes_masks_and_biases() -> None:
     device = Device("inivation_davis346")
     opened = source(device, biases={"expose": {"onbn": 1500}, "focus": {"onbn": 1600}}, exposure_us=700)
-    opened.call("set_window", [[10, 20, 30, 40]])
-    assert device.configuration is not None
-    window = device.configuration.region_of_interest
-    assert (window.left, window.top, window.width, window.height) == (10, 20, 30, 40)
     opened.call("apply_biases", ["expose"])
+    assert device.configuration is not None
     assert device.configuration.biases.onbn == 1500
     assert opened.call("set_mask", [[[1, 0], [0, 2]]]) == 2
     assert device.configuration.pixel_mask == (2, 1 + 2 * 346, 0, 0, 0, 0, 0, 0)
-    assert device.configuration.region_of_interest == window, "what was set before stays"
+    assert device.configuration.biases.onbn == 1500, "what was set before stays"
     assert device.configuration.exposure_us == 700
-    opened.call("set_window", [None])
-    assert device.configuration.region_of_interest == nd.inivation_davis346.RegionOfInterest()
 
 
 def test_a_dvxplorer_has_biases_and_no_more() -> None:
     opened = source(Device("inivation_dvxplorer", {"t": 5, "polarity_events": events(3)}))
-    assert opened.facts.abilities == ("biases",)
+    assert opened.facts.abilities == ("biases", "imu")
     assert opened.facts.geometry == Geometry(640, 480)
     packet = opened.read(0.0)
     assert packet is not None
     assert packet.events == 1
+
+
+@pytest.mark.parametrize("kind", ["inivation_davis346", "inivation_dvxplorer"])
+def test_inertial_samples_are_delivered_unless_they_are_not_wanted(kind: str) -> None:
+    fields = [*(f"{sensor}_{axis}" for sensor in ("accelerometer", "gyroscope") for axis in "xyz"), "temperature"]
+    samples = np.array([(70, 1, 2, 9.5, 0.25, 0, 0, 30)], [("t", "<u8"), *((name, "<f4") for name in fields)])
+    opened = source(Device(kind, *({"t": 100, "imu_events": samples} for _ in range(2))))
+    packet = opened.read(0.0)
+    assert packet is not None
+    assert packet.imu == (ImuSample(SensorUs(70), (1.0, 2.0, 9.5), (0.25, 0.0, 0.0), 30.0),)
+    opened.call("enable_imu", [False])
+    silent = opened.read(0.0)
+    assert silent is not None
+    assert silent.imu == ()
 
 
 def test_an_error_of_the_library_is_a_lost_camera() -> None:

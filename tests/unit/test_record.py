@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pytest
 from command_line import SMALL_RIG, Answer, caller
-from event_files import GEOMETRY, edge, many, packet, read_all
+from event_files import GEOMETRY, edge, many, packet, read_all, read_imu, sample
 
 from elpd.errors import CameraError, UsageError
 from elpd.events.evt3_encode import Evt3Encoder
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FIELDS = {
     *("out", "format", "width", "height", "seconds", "ended", "truncated", "reason", "events", "on", "first_us"),
-    *("last_us", "triggers", "frames", "lost", "lost_reason", "warnings"),
+    *("last_us", "triggers", "frames", "imu", "lost", "lost_reason", "warnings"),
 }
 FREE = 10**15
 
@@ -71,7 +71,8 @@ def arrays(n: int, each: int = 100, *, frame: bool = False) -> list[CameraPacket
     columns = many(n * each)
     pictures = [Frame(SensorUs(6000), SensorUs(7000), 500, np.full((48, 64), 9, np.uint8))] if frame else []
     return [packet([column[k * each : (k + 1) * each] for column in columns],
-                   triggers=[edge(5000 + k)] if k < 2 else [], frames=pictures if k == 1 else [])
+                   triggers=[edge(5000 + k)] if k < 2 else [], frames=pictures if k == 1 else [],
+                   imu=[sample(5000 + k)])
             for k in range(n)]  # fmt: skip
 
 
@@ -119,13 +120,14 @@ def test_words_are_written_as_they_came(tmp_path: Path) -> None:
         assert (reader.geometry, reader.notes["header"]["serial_number"]) == (GEOMETRY, "7")
 
 
-def test_arrays_frames_and_edges_go_to_aedat4(tmp_path: Path) -> None:
+def test_all_that_comes_with_arrays_goes_to_aedat4(tmp_path: Path) -> None:
     answer = made(tmp_path, arrays(20, frame=True)).answer
-    assert (answer["format"], answer["events"], answer["triggers"], answer["frames"]) == ("aedat4", 2000, 2, 1)
+    assert [answer[name] for name in ("format", "events", "triggers", "frames", "imu")] == ["aedat4", 2000, 2, 1, 20]
     columns, edges, frames = read_all(tmp_path / "r.aedat4")
     assert columns == [column.tolist() for column in many(2000)]
     assert edges == [edge(5000), edge(5001)]
     assert (frames[0].pixels == 9).all()
+    assert [one.t_us for one in read_imu(tmp_path / "r.aedat4")] == list(range(5000, 5020))
 
 
 @pytest.mark.parametrize(

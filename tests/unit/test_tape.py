@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import json
 import math
 import threading
 from pathlib import Path
@@ -16,8 +17,10 @@ from hypothesis import given, settings
 from scripted_rig import packet
 from scripted_rig import scripted_rig as rig_of
 
+from elpd import ports
 from elpd.errors import CameraError, FormatError, LensError, ReplayDiverged
 from elpd.ports import Biases, Closeable, HardwareRoi, Latency, PixelMask
+from elpd.record.abilities import ABILITIES as TAPED
 from elpd.record.playback import TapeReader, replay_rig
 from elpd.record.tape import TapeWriter, open_file, tape_rig
 from elpd.records import (
@@ -26,11 +29,13 @@ from elpd.records import (
     CommandStamp,
     Encoding,
     Frame,
+    ImuSample,
     LensFlag,
     LensReport,
     PositionEstimate,
     Roi,
     StopMode,
+    StopTiming,
     Trigger,
 )
 
@@ -71,6 +76,7 @@ def same(one: Any, other: Any) -> bool:
 
 times = st.integers(-(2**62), 2**62)
 floats = st.floats()
+axes = st.tuples(floats, floats, floats)
 
 
 @st.composite
@@ -102,6 +108,7 @@ def packets(draw: st.DrawFn) -> CameraPacket:
         gap_before=draw(st.booleans()),
         lost_events=draw(st.integers(0, 9)),
         backlog=draw(st.integers(0, 9)),
+        imu=tuple(draw(st.lists(st.builds(ImuSample, times, axes, axes, floats), max_size=2))),
     )
 
 
@@ -288,6 +295,68 @@ def test_asking_on_after_the_end_is_a_divergence(player: Player, tmp_path: Path)
         ReplayDiverged, match=r"after call 1: recorded nothing \(the run had ended\), asked clock.now_ns"
     ):
         rig.clock.now_ns()
+
+
+# Per ability: how a cycle uses it, and what the device then answers.
+USES: dict[str, tuple[Callable[[Any], Any], Any]] = {
+    "camera.HardwareRoi": (lambda rig: rig.camera.set_window(Roi(1, 2, 3, 4)), None),
+    "camera.Biases": (lambda rig: rig.camera.apply_biases(BiasSet.EXPOSE), None),
+    "camera.PixelMask": (lambda rig: rig.camera.set_mask([(1, 2)]), 1),
+    "camera.TriggerInput": (lambda rig: rig.camera.enable_trigger(on=True), None),
+    "camera.RateLimit": (lambda rig: rig.camera.limit_rate(2.5), None),
+    "camera.Temperature": (lambda rig: rig.camera.temperature_c(), float("nan")),
+    "camera.Inertial": (lambda rig: rig.camera.enable_imu(on=False), None),
+    "camera.Counters": (lambda rig: rig.camera.counters, scripted_rig.EveryCamera.counters),
+    "camera.Reopens": (lambda rig: rig.camera.reopen(), True),
+    "camera.Latency": (lambda rig: rig.camera.min_latency_us, 83.5),
+    "camera.Identified": (lambda rig: rig.camera.serial, "00000499"),
+    "camera.Remarks": (lambda rig: rig.camera.remarks, ("use a port of its own",)),
+    "camera.Closeable": (lambda rig: rig.camera.close(), None),
+    "lens.TakesMarks": (lambda rig: (rig.lens.mark_channel, rig.lens.mark(5))[1], True),
+    "lens.LearnsStops": (
+        lambda rig: (rig.lens.learn_stops({StopMode.ABRUPT: StopTiming(1.5, 0.1)}), rig.lens.capabilities)[1],
+        dataclasses.replace(scripted_rig.CAPABILITIES, stop_onset_ms=1.5),
+    ),
+    "lens.Outputs": (lambda rig: rig.lens.set_output(rig.lens.outputs[0], on=True), CommandStamp("iris", 1, 2)),
+    "lens.Identified": (lambda rig: rig.lens.serial, "L7"),
+    "lens.Remarks": (lambda rig: rig.lens.remarks, ("the adapter is slow",)),
+    "lens.Closeable": (lambda rig: rig.lens.close(), None),
+    "clock.Paced": (lambda rig: rig.clock.lag_s, 0.25),
+    "clock.Closeable": (lambda rig: rig.clock.close(), None),
+}
+NO_DEVICES = {"Scenery", "WritableFormat"}
+"""A simulator's truth and a file's format: what they can do is on no tape."""
+
+
+def test_every_ability_of_the_seams_is_taped() -> None:
+    optional = {name for name, kind in vars(ports).items() if getattr(kind, "_is_runtime_protocol", False)}
+    assert {name for abilities in TAPED.values() for name in abilities} == optional - NO_DEVICES
+    assert {f"{device}.{name}" for device, abilities in TAPED.items() for name in abilities} == USES.keys()
+
+
+@pytest.mark.parametrize("ability", USES)
+def test_what_an_ability_answered_is_answered_again(player: Player, tmp_path: Path, ability: str) -> None:
+    use, answer = USES[ability]
+    true = rig_of([answer], scripted_rig.EveryCamera, scripted_rig.EveryLens, clock=scripted_rig.PacedClock)
+    tape = TapeWriter(tmp_path)
+    assert same(use(tape_rig(true, tape)), answer)
+    tape.close()
+    reader = player(tmp_path)
+    assert same(use(replay_rig(reader)), answer)
+    assert reader.remaining() == 0
+
+
+def test_a_tape_from_before_these_abilities_were_on_it_is_read(player: Player, tmp_path: Path) -> None:
+    tape, parts = recorded(tmp_path, [7])
+    parts.clock.now_ns()
+    tape.close()
+    path = tmp_path / "tape.jsonl"
+    head, *calls = path.read_text().splitlines(keepends=True)
+    facts = json.loads(head)
+    for name in ("serials", "outputs", "mark_channel", "steps_to_um"):
+        del facts["facts"][name]
+    path.write_text("".join([json.dumps(facts) + "\n", *calls]))
+    assert replay_rig(player(tmp_path)).clock.now_ns() == 7
 
 
 class StrangeError(LensError):

@@ -43,7 +43,8 @@ WRITE = {**RIGHT, "X-Elpd": "1"}
         (405, "GET", "/api/roi?set=1", RIGHT),
         (404, "GET", "/api/stop", RIGHT),  # commands are not questions
         (404, "GET", "/api/focus", RIGHT),
-        (404, "POST", "/api/lease", WRITE),  # of no use: all tabs share a connection
+        (400, "POST", "/api/lease", WRITE),  # let in; the daemon misses what to do
+        (200, "POST", "/api/stop", {**WRITE, "Content-Type": "application/json; charset=klingon"}),
         (405, "PUT", "/api/stop", WRITE),
         (405, "POST", "/", WRITE),
         (404, "GET", "/../pyproject.toml", {}),

@@ -56,6 +56,12 @@ class _TriggerInput(_Asked):
         self.call("enable_trigger", on)
 
 
+class _Inertial(_Asked):
+    def enable_imu(self, *, on: bool) -> None:
+        """Deliver the inertial sensor's samples, or do not."""
+        self.call("enable_imu", on)
+
+
 class _RateLimit(_Asked):
     def limit_rate(self, mev_s: float | None) -> None:
         """Let the sensor send that many million events a second at most, or all with ``None``."""
@@ -73,6 +79,7 @@ ABILITIES: dict[str, type[_Asked]] = {
     "biases": _Biases,
     "mask": _Mask,
     "trigger": _TriggerInput,
+    "imu": _Inertial,
     "rate_limit": _RateLimit,
     "temperature": _Temperature,
 }

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from elpd.ports import Clock
-    from elpd.records import Frame, Geometry, Trigger
+    from elpd.records import Frame, Geometry, ImuSample, Trigger
     from elpd_drivers.cameras.ring import Taken
     from elpd_drivers.cameras.source import CaptureSettings, SourceFacts
 
@@ -36,7 +36,8 @@ LATE_CLOCK_NS = NS_PER_S
 LOOK_MS = 10.0
 """How long to wait at most before looking whether the child still turns."""
 
-MOST_EDGES = 4096
+MOST_KEPT = 4096
+"""Of packets that are thrown away, edges and inertial samples are kept: the newest of each, up to so many."""
 
 
 def open_captured(backend: str, settings: Mapping[str, Any], common: CaptureSettings, clock: Clock) -> CapturedCamera:
@@ -101,6 +102,7 @@ class CapturedCamera:
         self._gap, self._lost = False, 0
         self._frames: tuple[Frame, ...] = ()
         self._edges: tuple[Trigger, ...] = ()
+        self._imu: tuple[ImuSample, ...] = ()
         self._shedding = self._proven = False
         self._counts: dict[str, float] = dict.fromkeys(
             ("packets", "bytes", "events", "lost_events", "gaps", "late_packets_dropped", "most_waiting", "reopened"), 0
@@ -151,7 +153,7 @@ class CapturedCamera:
             self._lose(error)
             raise
         self._delivering = True
-        self._gap, self._lost, self._frames, self._edges = False, 0, (), ()
+        self._forget()
 
     def stop(self) -> None:
         """Stop delivering; the camera stays open. Idempotent."""
@@ -243,10 +245,12 @@ class CapturedCamera:
         self._lost += taken.lost_events
         self._frames += taken.frames
         self._edges += taken.triggers
+        self._imu += taken.imu
         if self._is_stale(taken, waiting):
             counts["late_packets_dropped"] += 1
             self._gap, self._lost = True, self._lost + taken.events
-            self._frames, self._edges = self._frames[-1:], self._edges[-MOST_EDGES:]
+            self._frames, self._edges = self._frames[-1:], self._edges[-MOST_KEPT:]
+            self._imu = self._imu[-MOST_KEPT:]
             return None
         packet = CameraPacket(
             data=np.frombuffer(taken.data, self._dtype),
@@ -258,6 +262,7 @@ class CapturedCamera:
             gap_before=self._gap,
             lost_events=self._lost,
             backlog=waiting + taken.backlog,
+            imu=self._imu,
         )
         if not self._proven:  # one that opens and then says nothing has not come back
             self._proven, self._pause_s, self._next_try_s = True, FIRST_PAUSE_S, 0.0
@@ -266,8 +271,12 @@ class CapturedCamera:
         counts["events"] += taken.events
         counts["lost_events"] += self._lost
         counts["gaps"] += self._gap
-        self._gap, self._lost, self._frames, self._edges = False, 0, (), ()
+        self._forget()
         return packet
+
+    def _forget(self) -> None:
+        """Begin to gather anew what goes with the next packet."""
+        self._gap, self._lost, self._frames, self._edges, self._imu = False, 0, (), (), ()
 
     def _is_stale(self, taken: Taken, waiting: int) -> bool:
         """Say whether to throw this packet away: from the first that is too late until none waits behind."""

@@ -1,4 +1,4 @@
-"""iniVation cameras through the maker's dv-processing: events, a DAVIS346's frames with their exposure, triggers.
+"""iniVation cameras through the maker's dv-processing: events, a DAVIS346's frames with their exposure, triggers, IMU.
 
 The library hands each stream out by itself and says nothing of how far it is. What dates a packet is the newest stamp
 in it, of events, of the inertial sensor (a thousand a second, also in the dark) or of a frame; a promise of
@@ -18,12 +18,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from elpd.errors import CameraError, ConfigError
-from elpd.records import BiasSet, Encoding, Frame, Geometry, Trigger
+from elpd.records import BiasSet, Encoding, Frame, Geometry, ImuSample, Trigger
 from elpd.units import US_PER_S, SensorUs
 from elpd_drivers.cameras.capture import CapturedCamera, open_captured
 from elpd_drivers.cameras.refusals import explain
 from elpd_drivers.cameras.ring import Captured
 from elpd_drivers.cameras.source import CaptureSettings, SourceFacts, layout_of, need, read_table
+from elpd_drivers.inertia import acceleration_m_s2, rotation_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -41,6 +42,9 @@ EVENTS = np.dtype({
 
 READ_OUT_US = 9_200
 """From the end of an exposure to the end of its read-out, in a recording of a DAVIS346 (the library does not say)."""
+
+CLOCK_JUMP_US = US_PER_S
+"""Nothing on the way from the sensor's streams to here takes a second; a sensor that was reset does."""
 
 TURN_S = 0.0003
 """The library's streams can only be asked, not waited for; this is a third of the shortest commit interval."""
@@ -61,7 +65,8 @@ class DavisSettings(CaptureSettings):
     """The table ``[camera]`` for the driver ``davis``.
 
     ``exposure_us`` is a number or ``"auto"``. ``interval_us`` is how often the library commits what it has: the
-    shorter, the sooner a packet comes and the more packets there are. ``frames`` and ``trigger`` switch those streams.
+    shorter, the sooner a packet comes and the more packets there are. ``frames``, ``trigger`` and ``imu`` switch those
+    streams.
     """
 
     exposure_us: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
@@ -69,6 +74,7 @@ class DavisSettings(CaptureSettings):
     interval_us: Annotated[int, Field(ge=1_000, le=10_000)] = 1_000
     frames: bool = True
     trigger: bool = True
+    imu: bool = True
     biases: BiasTables = BiasTables()
 
 
@@ -107,9 +113,11 @@ class DavisSource:
     def __init__(self, camera: Any, dv: Any, table: DavisSettings) -> None:
         self._camera, self._dv, self._table = camera, dv, table
         self._is_davis = hasattr(camera, "setCropAreaEvents")
+        self._has_detector = hasattr(camera, "setDetectorRunning")  # a DVXplorer Micro has no trigger input
         self._origin_us: int | None = None
         self._newest_us = 0
         self._frames = 0
+        self._with_imu = table.imu
         self._configure()
         width, height = camera.getEventResolution()
         self.facts = SourceFacts(
@@ -119,7 +127,7 @@ class DavisSource:
             serial=str(camera.getSerialNumber()),
             min_latency_us=table.interval_us if table.min_latency_us is None else table.min_latency_us,
             layout=layout_of(EVENTS),
-            abilities=("window", "biases", "trigger") if self._is_davis else ("window", "trigger"),
+            abilities=tuple(self._abilities()),
         )
 
     def read(self, timeout_s: float) -> Captured | None:
@@ -144,6 +152,8 @@ class DavisSource:
         elif name == "apply_biases":
             biases = self._table.biases
             self._set_biases(biases.expose if BiasSet(arguments[0]) is BiasSet.EXPOSE else biases.focus)
+        elif name == "enable_imu":
+            self._with_imu = bool(arguments[0])
         else:
             self._camera.setDetectorRunning(bool(arguments[0]))
 
@@ -153,7 +163,7 @@ class DavisSource:
 
     def close(self) -> None:
         """Stop the streams; the library closes the camera when it is forgotten. Idempotent."""
-        if self._camera is not None and self._camera.isRunning():
+        if hasattr(self._camera, "setEventsRunning") and self._camera.isRunning():
             self._camera.setEventsRunning(False)
         self._camera = None
 
@@ -162,11 +172,15 @@ class DavisSource:
     def _configure(self) -> None:
         camera, table = self._camera, self._table
         camera.setTimeInterval(timedelta(microseconds=table.interval_us))
-        camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
-        camera.setImuRunningAccelerometer(True)
-        camera.setDetectorRisingEdges(True)
-        camera.setDetectorFallingEdges(True)
-        camera.setDetectorRunning(table.trigger)
+        if hasattr(camera, "setUSBEarlyPacketDelay"):
+            camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
+        camera.setImuRunningAccelerometer(True)  # delivered or not, it keeps time in the dark
+        camera.setImuRunningGyroscope(True)
+        camera.setImuRunningTemperature(True)
+        if self._has_detector:
+            camera.setDetectorRisingEdges(True)
+            camera.setDetectorFallingEdges(True)
+            camera.setDetectorRunning(table.trigger)
         if not self._is_davis:
             if table.biases != BiasTables():
                 raise ConfigError("camera.biases: this camera's biases cannot be set one by one; remove the table")
@@ -179,6 +193,10 @@ class DavisSource:
             camera.setExposureDuration(timedelta(microseconds=table.exposure_us))
         self._normal = {name: camera.getDavis346BiasCoarseFine(self._bias(name)) for name in self._named()}
         self._set_biases(table.biases.focus)
+
+    def _abilities(self) -> list[str]:
+        has = {"window": True, "biases": self._is_davis, "trigger": self._has_detector, "imu": True}
+        return [name for name, there in has.items() if there]
 
     def _named(self) -> set[str]:
         return {*self._table.biases.expose, *self._table.biases.focus}
@@ -217,6 +235,7 @@ class DavisSource:
         if self._origin_us is None and stamps:
             self._origin_us = min(stamps) - US_PER_S
         origin_us = self._origin_us or 0
+        self._watch_clock(stamps)
         self._newest_us = max([self._newest_us, *(stamp - origin_us for stamp in stamps)])
         self._frames += frame is not None
         return Captured(
@@ -226,7 +245,14 @@ class DavisSource:
             events=0 if events is None else len(events),
             frames=() if frame is None else (_frame(frame, origin_us),),
             triggers=() if edges is None else tuple(self._edges(edges, origin_us)),
+            imu=tuple(_samples(motion, origin_us)) if motion and self._with_imu else (),
         )
+
+    def _watch_clock(self, stamps: Sequence[int]) -> None:
+        """Raise ``CameraError`` if the camera's clock was set back: streams are out of step, but not by a second."""
+        back_us = self._newest_us - (max(stamps, default=0) - (self._origin_us or 0))
+        if stamps and back_us > CLOCK_JUMP_US:
+            raise CameraError(f"camera: its clock jumped back by {back_us / US_PER_S:.3f} s; it was reset, start again")
 
     def _array(self, events: Any, origin_us: int) -> np.ndarray[Any, np.dtype[Any]]:
         """Copy the library's events, which are a view of its own memory, counted from our origin."""
@@ -264,3 +290,16 @@ def _frame(frame: Any, origin_us: int) -> Frame:
         exposure_us,
         np.array(frame.image),
     )
+
+
+def _samples(batch: Sequence[Any], origin_us: int) -> list[ImuSample]:
+    """Return the library's inertial samples, in m/s^2 and rad/s."""
+    return [
+        ImuSample(
+            SensorUs(one.timestamp - origin_us),
+            acceleration_m_s2((one.accelerometerX, one.accelerometerY, one.accelerometerZ)),
+            rotation_rad_s((one.gyroscopeX, one.gyroscopeY, one.gyroscopeZ)),
+            one.temperature,
+        )
+        for one in batch
+    ]

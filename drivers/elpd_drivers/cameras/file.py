@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from elpd.ports import Clock, EventCamera, RecordingReader
-    from elpd.records import Frame, Trigger
+    from elpd.records import Frame, ImuSample, Trigger
 
 PIECE_BYTES = 1 << 20
 DEFAULT_PACKET_US = 1000
@@ -126,6 +126,7 @@ class FileCamera:
             triggers=packet.triggers,
             gap_before=packet.gap_before,
             lost_events=packet.lost_events,
+            imu=packet.imu,
         )
 
     def stop(self) -> None:
@@ -147,10 +148,12 @@ class FileCamera:
         self._ends_us = 0
         frames: list[Frame] = []
         edges: list[Trigger] = []
+        samples: list[ImuSample] = []
         gap, lost = False, 0
         for piece in reader.packets(PIECE_BYTES):
             frames += piece.frames
             edges += piece.triggers
+            samples += piece.imu
             gap, lost = gap or piece.gap_before, lost + piece.lost_events
             position, size = 0, piece.data.shape[0]
             if self._origin_us is None:
@@ -171,6 +174,7 @@ class FileCamera:
                     triggers=_take(edges, [edge.t_us for edge in edges], self._ends_us) + splitter.take_triggers(),
                     gap_before=gap,
                     lost_events=lost,
+                    imu=_take(samples, [one.t_us for one in samples], self._ends_us),
                 )
                 gap, lost = False, 0
                 if not whole:
@@ -179,7 +183,15 @@ class FileCamera:
         if self._origin_us is not None:
             self._ends_us = max([self._ends_us, *(frame.available_us for frame in frames)])
             until_us = SensorUs(self._ends_us)
-            yield CameraPacket(piece.data[:0], piece.encoding, HostNs(0), until_us, tuple(frames), tuple(edges))
+            yield CameraPacket(
+                data=piece.data[:0],
+                encoding=piece.encoding,
+                received_ns=HostNs(0),
+                complete_until_us=until_us,
+                frames=tuple(frames),
+                triggers=tuple(edges),
+                imu=tuple(samples),
+            )
 
 
 class _Splitter:

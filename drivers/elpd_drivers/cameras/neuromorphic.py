@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import CameraError, UsageError
-from elpd.records import BiasSet, Encoding, Frame, Geometry, Trigger
+from elpd.records import BiasSet, Encoding, Frame, Geometry, ImuSample, Trigger
 from elpd.units import SensorUs
 from elpd_drivers.cameras.capture import CapturedCamera, open_captured
 from elpd_drivers.cameras.neuromorphic_tables import (
@@ -96,6 +96,7 @@ class NeuromorphicSource:
         self._device, self._module, self._kind = device, module, kind
         self._configuration, self._biases = configuration, table.biases
         self._exposure_us = table.exposure_us
+        self._with_imu = table.imu
         self._seen = _Seen()
         self._words = _word_stream(kind)
         properties = device.properties()
@@ -138,6 +139,9 @@ class NeuromorphicSource:
         """Use an ability; the library writes the registers from a thread of its own, within some milliseconds."""
         if name == "temperature_c":
             return float(self._device.temperature_celsius())
+        if name == "enable_imu":
+            self._with_imu = bool(arguments[0])
+            return None
         change: dict[str, Callable[..., dict[str, Any]]] = {
             "set_window": self._window,
             "apply_biases": self._bias_set,
@@ -177,6 +181,7 @@ class NeuromorphicSource:
             indices is not None and len(indices) > 0
             for indices in (packet.polarity_events_overflow_indices, packet.trigger_events_overflow_indices)
         )
+        samples = packet.imu_events if self._with_imu else None
         self._seen.overflows += gap
         return Captured(
             events,
@@ -187,13 +192,11 @@ class NeuromorphicSource:
             triggers=() if packet.trigger_events is None else tuple(_edges(packet.trigger_events)),
             gap_before=gap,
             backlog=status.ring.backlog,
+            imu=() if samples is None else tuple(_samples(samples)),
         )
 
     def _window(self, window: list[int] | None) -> dict[str, Any]:
-        width, height = self.facts.geometry.width, self.facts.geometry.height
-        if self._kind == "inivation_davis346":
-            x, y, w, h = window or [0, 0, width, height]
-            return {"region_of_interest": self._module.RegionOfInterest(left=x, top=y, width=w, height=h)}
+        height = self.facts.geometry.height
         mask = self._module.RowColumnMask(set=window is not None)
         if window is not None:
             x, y, w, h = window
@@ -227,9 +230,11 @@ class NeuromorphicSource:
 def _abilities(kind: str, configuration: Any) -> list[str]:
     known = {field.name for field in fields(configuration)}
     abilities = {
-        "window": bool(known & {"x_mask", "region_of_interest"}),
+        # Of a DAVIS346, too, the library can set one, but with it switches the frames off until it opens anew.
+        "window": "x_mask" in known,
         "biases": "biases" in known,
         "mask": kind in MASK_SLOTS,
+        "imu": kind.startswith("inivation"),
         "temperature": kind == "prophesee_evk4",
     }
     return [name for name, has in abilities.items() if has]
@@ -261,4 +266,12 @@ def _edges(events: Any) -> list[Trigger]:
     return [
         Trigger(SensorUs(int(t)), int(channel), rising=int(edge) > 0)
         for t, channel, edge in zip(events["t"], events["id"], polarity, strict=True)
+    ]
+
+
+def _samples(events: Any) -> list[ImuSample]:
+    """Return the library's inertial samples, which have our units: m/s^2, rad/s and degrees Celsius."""
+    return [
+        ImuSample(SensorUs(t), (ax, ay, az), (gx, gy, gz), celsius)
+        for t, ax, ay, az, gx, gy, gz, celsius in events.tolist()
     ]

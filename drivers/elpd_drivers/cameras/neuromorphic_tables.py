@@ -42,13 +42,15 @@ class NeuromorphicSettings(CaptureSettings):
 
     ``model`` is ``auto`` (what is plugged in) or one of ``MODELS``. ``rate_limit_mev_s`` bounds what a Prophesee sensor
     sends, ``trigger`` listens to an EVK4's trigger input: the library sets both when it opens and not later.
-    ``usb_packets`` is how many buffers of 128 KiB it keeps. ``exposure_us`` and ``frame_interval_us`` are a DAVIS346's.
+    ``usb_packets`` is how many buffers of 128 KiB it keeps. ``exposure_us`` and ``frame_interval_us`` are a DAVIS346's,
+    ``imu`` says whether the samples of an iniVation camera's inertial sensor are delivered.
     """
 
     model: Literal["auto", "evk4", "evk3-hd", "centuryarks-vga", "davis346", "dvxplorer"] = "auto"
     biases: BiasTables = BiasTables()
     rate_limit_mev_s: Annotated[float, Field(gt=0, le=1000)] | None = None
     trigger: bool = True
+    imu: bool = True
     usb_packets: Annotated[int, Field(gt=BUFFERS_IN_FLIGHT, le=4096)] = 256
     exposure_us: Annotated[int, Field(ge=1, le=1_000_000)] = 4000
     frame_interval_us: Annotated[int, Field(ge=1, le=10_000_000)] = 40_000

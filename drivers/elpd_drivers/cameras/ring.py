@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.records import Frame, Trigger
+from elpd.records import Frame, ImuSample, Trigger
 from elpd.units import SensorUs
 
 if TYPE_CHECKING:
@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ALIGNMENT = 64
-_SLOT = struct.Struct("<13q")
+_SLOT = struct.Struct("<14q")
 _FRAME = struct.Struct("<6q")
 _TRIGGER = struct.Struct("<3q")
+_SAMPLE = struct.Struct("<q7d")
 _SLOT_BYTES = 128
 _WRITTEN, _READ, _RELEASED, _HEARTBEAT, _NOTES_VERSION, _NOTES_LENGTH = (ALIGNMENT * place for place in range(6))
 """Offsets of the single numbers in the first page, each in a cache line of its own."""
@@ -58,6 +59,7 @@ class Captured:
     gap_before: bool = False
     lost_events: int = 0
     backlog: int = 0
+    imu: tuple[ImuSample, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,7 @@ class Taken:
     gap_before: bool
     lost_events: int
     backlog: int
+    imu: tuple[ImuSample, ...]
 
 
 class RingMemory:
@@ -184,6 +187,7 @@ class RingWriter:
             int(packet.gap_before or self._gap),
             packet.lost_events + self._lost,
             packet.backlog,
+            len(packet.imu),
             self._written,
         )
         self._head = begin + size
@@ -228,14 +232,15 @@ class RingReader:
             return None
         self._give_back()
         memory = self._memory
-        (place, size, end, generation, received_ns, until, events, frames, triggers, gap, lost, backlog, number) = (
-            _SLOT.unpack_from(memory.map, memory.slot(self._taken))
-        )
+        header = _SLOT.unpack_from(memory.map, memory.slot(self._taken))
+        (place, size, end, generation, received_ns, until, events) = header[:7]
+        (frames, triggers, gap, lost, backlog, imu, number) = header[7:]
         assert number == self._taken, f"packet {number} lies where {self._taken} belongs"
         self._taken += 1
         self._release_to = end
         at = place + _padded(size)
         edges, at = _read_triggers(memory.map, at, triggers)
+        samples, at = _read_imu(memory.map, at, imu)
         return Taken(
             data=memory.view[place : place + size].toreadonly(),
             generation=generation,
@@ -247,6 +252,7 @@ class RingReader:
             gap_before=bool(gap),
             lost_events=lost,
             backlog=backlog,
+            imu=samples,
         )
 
     @property
@@ -285,6 +291,8 @@ def _as_bytes(data: NDArray[Any]) -> NDArray[np.uint8]:
 def _extras(packet: Captured) -> Iterator[bytes]:
     for edge in packet.triggers:
         yield _TRIGGER.pack(edge.t_us, edge.id, edge.rising)
+    for one in packet.imu:
+        yield _SAMPLE.pack(one.t_us, *one.acceleration_m_s2, *one.rotation_rad_s, one.temperature_c)
     for frame in packet.frames:
         height, width = frame.pixels.shape
         depth = frame.pixels.itemsize
@@ -300,6 +308,12 @@ def _read_triggers(memory: mmap.mmap, at: int, count: int) -> tuple[tuple[Trigge
         edges.append(Trigger(SensorUs(t_us), channel, bool(rising)))
         at += _TRIGGER.size
     return tuple(edges), at
+
+
+def _read_imu(memory: mmap.mmap, at: int, count: int) -> tuple[tuple[ImuSample, ...], int]:
+    end = at + count * _SAMPLE.size
+    rows = _SAMPLE.iter_unpack(memory[at:end])
+    return tuple(ImuSample(SensorUs(t), (ax, ay, az), (gx, gy, gz), c) for t, ax, ay, az, gx, gy, gz, c in rows), end
 
 
 def _read_frames(memory: mmap.mmap, at: int, count: int) -> tuple[Frame, ...]:

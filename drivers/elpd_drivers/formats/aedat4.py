@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import FormatError
-from elpd.records import CameraPacket, Encoding, Frame, Geometry, Trigger
+from elpd.records import CameraPacket, Encoding, Frame, Geometry, ImuSample, Trigger
 from elpd.units import HostNs, SensorUs
 from elpd_drivers.formats import aedat4_write, flat
 from elpd_drivers.formats.aedat4_header import MAGIC, MAX_PACKET_BYTES, decompressor, read_header
+from elpd_drivers.inertia import acceleration_m_s2, rotation_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -39,6 +40,8 @@ CHANNELS = {1: (0, True), 2: (0, False), 3: (0, True), 4: (1, True), 5: (1, Fals
 CLOCK_RESET = 0
 GREY = {0: 1, 16: 3, 24: 4}
 """A frame's format, as the number of its colours."""
+SAMPLE_BYTES = 500
+"""What an inertial sample takes in memory, roughly."""
 
 
 class Aedat4Format:
@@ -85,18 +88,26 @@ class _Pending:
     events: list[NDArray[Any]] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
     edges: list[Trigger] = field(default_factory=list)
+    imu: list[ImuSample] = field(default_factory=list)
     held_bytes: int = 0
 
     def taken(self) -> CameraPacket:
         """Return it as one packet and begin anew."""
         data = np.concatenate(self.events) if self.events else np.empty(0, EVENT)
-        packet = CameraPacket(data, Encoding.ARRAY, HostNs(0), frames=tuple(self.frames), triggers=tuple(self.edges))
+        packet = CameraPacket(
+            data,
+            Encoding.ARRAY,
+            HostNs(0),
+            frames=tuple(self.frames),
+            triggers=tuple(self.edges),
+            imu=tuple(self.imu),
+        )
         self.__init__()  # type: ignore[misc]
         return packet
 
 
 class Aedat4Reader:
-    """An open AEDAT4 file. ``notes``: format, header, imu, warnings, lost, lost_reason."""
+    """An open AEDAT4 file. ``notes``: format, header, warnings, lost, lost_reason."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -111,6 +122,7 @@ class Aedat4Reader:
         streams = self._header.streams
         self._events_id = next((k for k, (kind, _) in streams.items() if kind == "EVTS"), None)
         self._frames_id = next((k for k, (kind, _) in streams.items() if kind == "FRME"), None)
+        self._imu_id = next((k for k, (kind, _) in streams.items() if kind == "IMUS"), None)
         self._geometry = next((size for _, size in streams.values() if size is not None), None)
         if self._events_id is not None and streams[self._events_id][1] is not None:
             self._geometry = streams[self._events_id][1]
@@ -124,7 +136,7 @@ class Aedat4Reader:
 
     @property
     def notes(self) -> Mapping[str, Any]:
-        """``format``, ``header``, ``imu`` (samples), ``warnings``, ``lost`` (packets), ``lost_reason``."""
+        """``format``, ``header``, ``warnings``, ``lost`` (packets), ``lost_reason``."""
         return self._notes
 
     def packets(self, max_bytes: int = 1 << 20) -> Iterator[CameraPacket]:
@@ -143,7 +155,7 @@ class Aedat4Reader:
                     yield pending.taken()
         except OSError as error:
             raise FormatError(f"{self._path} cannot be read: {error.strerror}") from error
-        if pending.events or pending.frames or pending.edges:
+        if pending.events or pending.frames or pending.edges or pending.imu:
             yield pending.taken()
         self._end_notes()
 
@@ -185,8 +197,10 @@ class Aedat4Reader:
                 if code in CHANNELS:
                     pending.edges.append(Trigger(SensorUs(t), *CHANNELS[code]))
             pending.held_bytes += len(data)
-        elif kind == "IMUS":
-            self._notes["imu"] += flat.root(data, b"IMUS").vector(0, 4)[1]
+        elif kind == "IMUS" and stream == self._imu_id:
+            samples = [_sample(one) for one in flat.root(data, b"IMUS").tables(0)]
+            pending.imu += samples
+            pending.held_bytes += SAMPLE_BYTES * len(samples)
 
     def _frame(self, table: flat.Table, geometry: Geometry | None) -> Frame | None:
         """Return a frame of the whole sensor, else ``None``, counted."""
@@ -220,9 +234,9 @@ class Aedat4Reader:
         self._odd_frames[text] = self._odd_frames.get(text, 0) + 1
 
     def _begin_notes(self) -> None:
-        self._notes |= {"imu": 0, "lost": 0, "lost_reason": [], "warnings": []}
+        self._notes |= {"lost": 0, "lost_reason": [], "warnings": []}
         kinds = [kind for kind, _ in self._header.streams.values()]
-        for kind, what in (("EVTS", "events"), ("FRME", "frames")):
+        for kind, what in (("EVTS", "events"), ("FRME", "frames"), ("IMUS", "IMU samples")):
             if kinds.count(kind) > 1:
                 self._notes["warnings"].append(f"{kinds.count(kind)} streams of {what}; the first is read")
         if self._header.table_at < 0:
@@ -237,3 +251,14 @@ class Aedat4Reader:
         if self._damaged:
             self._notes["lost"] += self._damaged
             self._notes["lost_reason"].append(f"{self._damaged} packets are damaged")
+
+
+def _sample(table: flat.Table) -> ImuSample:
+    """Return an inertial sample: stored are the time, the temperature, three of gravity, three of degrees a second."""
+    ax, ay, az, gx, gy, gz = (table.real(field) for field in range(2, 8))
+    return ImuSample(
+        SensorUs(table.scalar(0, "q", 0)),
+        acceleration_m_s2((ax, ay, az)),
+        rotation_rad_s((gx, gy, gz)),
+        table.real(1),
+    )

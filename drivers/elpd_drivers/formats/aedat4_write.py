@@ -1,4 +1,4 @@
-"""Writing AEDAT4 files: events, frames and trigger edges, uncompressed, with the table of contents at the end.
+"""Writing AEDAT4 files: events, frames, edges and IMU samples, uncompressed, with the table of contents at the end.
 
 Without compression nothing but numpy is needed to write, and every reader of AEDAT4 can read. A file whose writer was
 stopped has no table; DV and ours read it packet by packet all the same.
@@ -18,6 +18,7 @@ from elpd.ports import WriterTraits
 from elpd_drivers.formats import flat
 from elpd_drivers.formats.aedat4_header import MAGIC
 from elpd_drivers.formats.output import Output, columns_inside
+from elpd_drivers.inertia import acceleration_g, rotation_deg_s
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from elpd.records import CameraPacket, Frame, Geometry, Trigger
+    from elpd.records import CameraPacket, Frame, Geometry, ImuSample, Trigger
 
-EVENTS, FRAMES, EDGES = 0, 1, 2
-KINDS = {EVENTS: ("EVTS", "events"), FRAMES: ("FRME", "frames"), EDGES: ("TRIG", "triggers")}
+EVENTS, FRAMES, EDGES, IMU = 0, 1, 2, 3
+KINDS = {EVENTS: ("EVTS", "events"), FRAMES: ("FRME", "frames"), EDGES: ("TRIG", "triggers"), IMU: ("IMUS", "imu")}
+WITHOUT_SIZE = {EDGES, IMU}
 EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "u1"], "offsets": [0, 8, 10, 12],
                   "itemsize": 16})  # fmt: skip
 TYPES = {(0, True): 1, (0, False): 2, (1, True): 4, (1, False): 5,
@@ -57,8 +59,8 @@ class Aedat4Writer:
 
     @property
     def traits(self) -> WriterTraits:
-        """Events, trigger edges and frames, of any time."""
-        return WriterTraits(triggers=True, frames=True)
+        """Events, trigger edges, frames and IMU samples, of any time."""
+        return WriterTraits(triggers=True, frames=True, imu=True)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -71,7 +73,7 @@ class Aedat4Writer:
         return tuple(f"{count} {text}" for count, text in found if count)
 
     def write(self, packet: CameraPacket) -> None:
-        """Append events, edges and frames. See ``RecordingWriter.write``."""
+        """Append events, edges, frames and IMU samples. See ``RecordingWriter.write``."""
         t, x, y, p = columns_inside(packet, self._geometry)
         if t.size:
             events = np.zeros(t.size, EVENT)
@@ -81,12 +83,14 @@ class Aedat4Writer:
             span_us = abs(int(t[-1]) - int(self._held[0]["t"][0]))
             if self._held_events >= EVENTS_PER_PACKET or span_us >= HELD_US:
                 self._write_events()
-        if packet.triggers or packet.frames:
+        if packet.triggers or packet.frames or packet.imu:
             self._write_events()
         if packet.triggers:
             self._write_edges(packet.triggers)
         for frame in packet.frames:
             self._write_frame(frame)
+        if packet.imu:
+            self._write_imu(packet.imu)
 
     def close(self, *, complete: bool = True) -> None:
         """Finish: append the table of contents, unless the file was cut short. Idempotent."""
@@ -134,6 +138,13 @@ class Aedat4Writer:
             rows.append({0: ("q", edge.t_us), 1: ("b", kind)})
         self._append(EDGES, {0: rows}, len(edges), edges[0].t_us, edges[-1].t_us)
 
+    def _write_imu(self, samples: tuple[ImuSample, ...]) -> None:
+        rows: list[flat.Fields] = []
+        for one in samples:
+            measured = (one.temperature_c, *acceleration_g(one.acceleration_m_s2), *rotation_deg_s(one.rotation_rad_s))
+            rows.append({0: ("q", one.t_us), **{k: ("f", value) for k, value in enumerate(measured, start=1)}})
+        self._append(IMU, {0: rows}, len(samples), samples[0].t_us, samples[-1].t_us)
+
     def _write_frame(self, frame: Frame) -> None:
         if frame.pixels.shape != (self._geometry.height, self._geometry.width):
             self._other_frames += 1
@@ -180,7 +191,7 @@ def _description(geometry: Geometry, source: str) -> str:
     """Return the streams' description in DV's XML."""
     nodes = []
     for number, (kind, name) in KINDS.items():
-        size = {"sizeX": geometry.width, "sizeY": geometry.height} if number != EDGES else {}
+        size = {"sizeX": geometry.width, "sizeY": geometry.height} if number not in WITHOUT_SIZE else {}
         info = "".join(f'<attr key="{key}" type="int">{value}</attr>' for key, value in size.items())
         attributes = {
             "compression": "NONE",

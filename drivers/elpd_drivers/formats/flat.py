@@ -15,7 +15,7 @@ from elpd.errors import FormatError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SIZES = {"b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "q": 8}
+SIZES = {"b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "q": 8, "f": 4}
 
 
 class Table(NamedTuple):
@@ -28,6 +28,11 @@ class Table(NamedTuple):
         """Return a scalar of ``struct``'s *letter*, or the *default* where it is not stored."""
         where = self._where(field)
         return default if where is None else int(_unpack(letter, self.data, where))
+
+    def real(self, field: int) -> float:
+        """Return a 32-bit float, 0 where it is not stored."""
+        where = self._where(field)
+        return 0.0 if where is None else float(_unpack("f", self.data, where))
 
     def vector(self, field: int, item_bytes: int) -> tuple[int, int]:
         """Return where a vector's items begin and how many there are; (0, 0) where it is not stored."""
@@ -69,7 +74,7 @@ class Vector:
     length: int
 
 
-Fields = dict[int, "tuple[str, int] | Vector | Tables"]
+Fields = dict[int, "tuple[str, float] | Vector | Tables"]
 """What to write in a table: a scalar's ``struct`` letter and value, a vector, or tables."""
 
 

@@ -4,6 +4,7 @@
 // way at a time; STOP always finds a connection free.
 
 const KEY = "elpd-token";
+const TAB = crypto.getRandomValues(new Uint32Array(2)).join("-"); // whose lease it is, among the tabs of one gateway
 const MOST_COMMANDS = 2;
 
 export class Refused extends Error {
@@ -43,11 +44,14 @@ export async function command(method, params = {}) {
   }
 }
 
+/** The lease: not counted, so that long commands do not let it end; given back even while the page is closed. */
+export const lease = (params) => post("lease", params, { keepalive: true });
+
 /** STOP and cancel: not counted, not queued, sent even while the page is closed. */
 export const urgent = (method) => post(method, {}, { keepalive: true, priority: "high" });
 
 async function post(method, params, options) {
-  const headers = { ...bearer(), "Content-Type": "application/json", "X-Elpd": "1" };
+  const headers = { ...bearer(), "Content-Type": "application/json", "X-Elpd": "1", "X-Elpd-Tab": TAB };
   const answer = await reach(`api/${method}`, { method: "POST", headers, body: JSON.stringify(params), ...options });
   return answer.json();
 }

@@ -31,7 +31,7 @@ export function createChart(place, tell = () => {}) {
       scales: { x: { time: false, range: spanX }, y: { range: spanY } },
       axes: [
         { ...axis, size: 30, gap: 4, values: (_, values) => values.map((value, nth) => (nth === values.length - 1 ? `${value} µm` : `${value}`)) },
-        { ...axis, size: 44, gap: 4, values: (_, values) => values.map(short) },
+        { ...axis, size: 44, gap: 4, values: (self, values) => values.map((value) => (self.data[0].length ? short(value) : "")) },
       ],
       series,
       hooks: {
@@ -111,6 +111,7 @@ export function createChart(place, tell = () => {}) {
     const width = ctx.measureText(text).width;
     const left = Math.min(Math.max(x - width / 2, self.bbox.left), self.bbox.left + self.bbox.width - width);
     ctx.fillStyle = colour;
+    ctx.textAlign = "left"; // whatever the axes have left behind
     ctx.textBaseline = "bottom";
     ctx.fillText(text, left, self.bbox.top - 2);
     ctx.restore();
@@ -129,13 +130,13 @@ export function createChart(place, tell = () => {}) {
   rebuild();
 
   return {
-    /** Show samples and marks; returns where ELP crossed zero. */
+    /** Show samples and marks; returns where ELP crossed zero, and how many ways there are. */
     show(samples, { focus = null, lens = null } = {}) {
       marks = { focus, lens, crossing: crossing(samples) };
       const last = ways(samples).slice(-SHOWN_WAYS).reverse().map(columns);
       while (last.length < SHOWN_WAYS) last.push([[], [], []]);
       chart.setData(last.some((way) => way[0].length) ? uPlot.join(last) : [[], ...Array.from({ length: 2 * SHOWN_WAYS }, () => [])]);
-      return marks.crossing;
+      return { crossing: marks.crossing, ways: last.filter((way) => way[0].length).length };
     },
     /** Move the lens's mark alone. */
     lens(position) {
@@ -163,5 +164,5 @@ function short(value) {
   const size = Math.abs(value);
   if (size >= 1e6) return `${(value / 1e6).toFixed(size < 1e7 ? 1 : 0)}M`;
   if (size >= 1e3) return `${(value / 1e3).toFixed(size < 1e4 ? 1 : 0)}k`;
-  return `${Math.round(value)}`;
+  return `${size < 10 ? Number(value.toPrecision(2)) : Math.round(value)}`;
 }

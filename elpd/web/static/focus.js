@@ -4,8 +4,8 @@ import { urgent } from "./api.js";
 import { createChart } from "./chart.js";
 import { $, facts, make, say, show } from "./dom.js";
 import { trouble } from "./notices.js";
-import { live } from "./store.js";
-import { PHASES, PHASE_NAMES, ms, outcomeText, phaseText, sigma, um } from "./words.js";
+import { mayOperate } from "./store.js";
+import { PHASES, PHASE_NAMES, ms, outcomeText, phaseText, prose, sigma, um } from "./words.js";
 
 export function mountFocus(store, { act }) {
   const chart = createChart($("plot"), (text) => say($("readout"), text));
@@ -30,7 +30,7 @@ export function mountFocus(store, { act }) {
 
   store.listen((state) => {
     const running = state.state === "FOCUSING" || Boolean(state.cycle && !state.cycle.result && state.cycle.phase);
-    const may = live(state) && state.link.role !== "observe";
+    const may = mayOperate(state);
     $("focus").disabled = !may || running || state.fault !== null || state.state !== "READY";
     say($("focus"), running ? "Focusing…" : $("dry-run").checked ? "Try without moving" : "Focus");
     $("focus").dataset.busy = running ? "yes" : "";
@@ -43,13 +43,21 @@ export function mountFocus(store, { act }) {
     const key = `${state.samples.length}|${found}|${state.samples[0]?.[3]}`;
     if (key !== drawn) {
       drawn = key;
-      const crossed = chart.show(state.samples, { focus: found, lens });
+      const drawing = chart.show(state.samples, { focus: found, lens });
       $("plot").dataset.points = chart.points();
-      if (state.samples.length) say($("curve-summary"), summary(crossed, found, state.samples.length));
+      legend({ curve: drawing.ways > 0, before: drawing.ways > 1, crossing: drawing.crossing !== null, focus: found !== null, lens: drawing.ways > 0 && lens !== null });
+      if (state.samples.length) say($("curve-summary"), summary(drawing.crossing, found, state.samples.length));
     } else chart.lens(lens);
   });
   $("dry-run").addEventListener("change", () => store.send("", {}));
   return chart;
+}
+
+/** Name what is drawn, and nothing else. */
+function legend(drawn) {
+  show($("no-curve"), !drawn.curve);
+  show($("legend"), drawn.curve);
+  for (const item of $("legend").children) show(item, drawn[item.dataset.of]);
 }
 
 function summary(crossed, found, windows) {
@@ -82,11 +90,11 @@ function result(ended) {
   show($("found").parentElement, ended.focus_um !== null);
   say($("found"), um(ended.focus_um));
   say($("found-sigma"), sigma(ended.sigma_um));
-  say($("reason"), ended.reason);
+  say($("reason"), prose(ended.reason));
   const remarks = ended.warnings ?? [];
   if ($("remarks").dataset.key !== JSON.stringify(remarks)) {
     $("remarks").dataset.key = JSON.stringify(remarks);
-    $("remarks").replaceChildren(...remarks.map((text) => make("li", { textContent: text })));
+    $("remarks").replaceChildren(...remarks.map((text) => make("li", { textContent: prose(text) })));
   }
   facts($("result-facts"), resultFacts(ended));
 }

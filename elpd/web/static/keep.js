@@ -3,7 +3,7 @@
 import { ask } from "./api.js";
 import { $, make, say, show } from "./dom.js";
 import { trouble } from "./notices.js";
-import { live } from "./store.js";
+import { live, mayOperate } from "./store.js";
 import { MODES, um } from "./words.js";
 
 export function mountKeep(store, { act }) {
@@ -54,7 +54,7 @@ export function mountKeep(store, { act }) {
     for (const radio of document.querySelectorAll("[name=mode]")) radio.checked = radio.value === state.mode;
     show($("period-form"), state.mode === "scheduled");
     say($("mode-help"), MODES[state.mode] ?? "");
-    const may = now && state.link.role !== "observe";
+    const may = mayOperate(state);
     for (const control of document.querySelectorAll(".keep button, .keep input")) control.disabled = !may;
   });
 }
@@ -74,7 +74,7 @@ export function mountRig(store, { act }) {
     if (answer) say($("rig-echo"), answer.offset_um === null ? "No table of temperatures is configured." : `${answer.celsius} °C moves focus by ${um(answer.offset_um)} µm.`);
   });
   store.listen((state) => {
-    const may = live(state) && state.link.role !== "observe" && state.state === "READY";
-    for (const control of document.querySelectorAll(".rig-card button, .rig-card input")) control.disabled = !may;
+    const may = mayOperate(state) && state.state === "READY";
+    for (const control of document.querySelectorAll(".rig-card .forms :is(button, input)")) control.disabled = !may;
   });
 }

@@ -1,7 +1,7 @@
 // The lens by hand: where it is, jog, go to, home.
 
 import { $, say } from "./dom.js";
-import { live } from "./store.js";
+import { mayOperate } from "./store.js";
 import { sigma, um } from "./words.js";
 
 export function mountLens(store, { act }) {
@@ -31,7 +31,7 @@ export function mountLens(store, { act }) {
       [$("move-to").min, $("move-to").max] = limits;
       ticks(limits);
     }
-    const may = live(state) && state.link.role !== "observe" && state.state === "READY" && state.fault === null && !state.busy;
+    const may = mayOperate(state) && state.state === "READY" && state.fault === null;
     for (const control of document.querySelectorAll(".lens button, .lens input")) control.disabled = !may;
   });
 }

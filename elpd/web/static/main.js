@@ -3,6 +3,7 @@
 import { Refused, command, keepToken, onLocked, readToken, stream, urgent } from "./api.js";
 import { $, facts, say } from "./dom.js";
 import { mountFocus } from "./focus.js";
+import { mountLease } from "./lease.js";
 import { mountKeep, mountRig } from "./keep.js";
 import { mountLens } from "./lens.js";
 import { mountNotices, speak, trouble } from "./notices.js";
@@ -123,6 +124,7 @@ mountFocus(store, { act });
 mountLens(store, { act });
 mountKeep(store, { act });
 mountRig(store, { act });
+mountLease(store);
 mountRuns(store);
 
 if (readToken()) restart(follow(stream, store.send));

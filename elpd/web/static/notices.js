@@ -1,14 +1,15 @@
 // What must not be missed: a latched fault, a connection that is away, what a command met, what the person should change.
 
 import { $, make, say, show } from "./dom.js";
-import { adviceTitle, readable } from "./words.js";
+import { mayOperate } from "./store.js";
+import { adviceTitle, prose, readable } from "./words.js";
 
 const SHOWN_MS = 9000;
 
 /** Tell of a command that failed; stays until it is dismissed if it concerns STOP. */
 export function trouble(message, { lasting = false } = {}) {
   const close = make("button", { type: "button", className: "plain", textContent: "Dismiss" });
-  const note = make("div", { className: "trouble" }, make("p", { textContent: message }), close);
+  const note = make("div", { className: "trouble" }, make("p", { textContent: prose(message) }), close);
   close.addEventListener("click", () => note.remove());
   const old = $("trouble").children;
   while (old.length >= 3) old[0].remove();
@@ -17,7 +18,7 @@ export function trouble(message, { lasting = false } = {}) {
 }
 
 /** For those who do not see the page. */
-export const speak = (text) => say($("spoken"), text);
+export const speak = (text) => say($("spoken"), prose(text));
 
 export function mountNotices(store, { act, unlock }) {
   $("clear").addEventListener("click", () => act("clear", {}, $("clear")));
@@ -35,7 +36,8 @@ export function mountNotices(store, { act, unlock }) {
 
     show($("fault"), state.fault !== null);
     say($("fault-title"), state.fault ? `Fault: ${readable(faultWord(state.fault.kind))}` : "");
-    say($("fault-text"), state.fault?.message ?? "");
+    say($("fault-text"), prose(state.fault?.message));
+    $("clear").disabled = !mayOperate(state);
 
     const [title, text] = away(state);
     show($("offline"), Boolean(title) && !state.locked);
@@ -65,5 +67,5 @@ function advise(state) {
   show($("warnings"), warnings.length > 0);
   if (list.dataset.key === key) return;
   list.dataset.key = key;
-  list.replaceChildren(...warnings.map(([title, text]) => make("li", {}, make("strong", { textContent: title }), make("span", { textContent: text }))));
+  list.replaceChildren(...warnings.map(([title, text]) => make("li", {}, make("strong", { textContent: title }), make("span", { textContent: prose(text) }))));
 }

@@ -6,7 +6,7 @@ import { $, make, save, say, show } from "./dom.js";
 import { speak, trouble } from "./notices.js";
 import { regionEditor } from "./region.js";
 import { same } from "./roi.js";
-import { live } from "./store.js";
+import { live, mayOperate } from "./store.js";
 import { duration, um } from "./words.js";
 
 const LIVE_MS = 250;
@@ -147,7 +147,11 @@ export function mountPicture(store) {
       refresh();
     }
     wasLive = now;
-    editor.enable(now && state.link.role !== "observe");
+    const may = mayOperate(state);
+    editor.enable(may);
+    for (const control of document.querySelectorAll(".region-form :is(button, input, select)")) control.disabled = !may;
+    if (may) $("roi-named").disabled = Object.keys(named).length === 0;
+    $("download").disabled = !now || !shown;
     show($("kind-frame"), Boolean(state.status?.camera.has_frames));
     const region = state.status?.roi;
     if (region !== undefined && known !== undefined && !same(region, known)) {

@@ -73,6 +73,10 @@ export function regionEditor(svg, { commit, changed }) {
     event.preventDefault();
   });
 
+  // A finger that holds the region is no gesture of the browser's. touch-action keeps it from scrolling, but Chromium still
+  // lets the lift begin a fling, and the next tap, wherever it is, only ends that.
+  svg.addEventListener("touchstart", (event) => drag && event.cancelable && event.preventDefault(), { passive: false });
+
   svg.addEventListener("pointermove", (event) => {
     const at = point(event);
     if (!drag) {

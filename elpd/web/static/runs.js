@@ -6,7 +6,7 @@ import { $, facts, make, save, say, show } from "./dom.js";
 import { resultFacts } from "./focus.js";
 import { trouble } from "./notices.js";
 import { live } from "./store.js";
-import { moment, outcomeText, sigma, um } from "./words.js";
+import { moment, outcomeText, prose, sigma, um } from "./words.js";
 
 export function mountRuns(store) {
   let chart = null;
@@ -18,7 +18,8 @@ export function mountRuns(store) {
   async function load() {
     try {
       const { runs } = await ask("runs", { limit: 30 });
-      say($("runs-caption"), runs.length ? "" : "none yet");
+      say($("runs-caption"), runs.length ? "newest first" : "");
+      show($("no-runs"), runs.length === 0);
       $("runs").replaceChildren(...runs.map(row));
       mark();
     } catch (error) {
@@ -31,7 +32,7 @@ export function mountRuns(store) {
       "button", { type: "button", className: "run" },
       make("i", { className: "light", ariaHidden: "true" }),
       make("span", { className: "run-when", textContent: moment(run.at) }),
-      make("span", { className: "run-what", textContent: run.outcome === "FOCUSED" ? `${um(run.focus_um, 1)} µm ${sigma(run.sigma_um)}` : outcomeText(run.outcome) }),
+      make("span", { className: "run-what", textContent: run.outcome === "FOCUSED" ? `${um(run.focus_um, 1)} µm` : outcomeText(run.outcome) }, ...(run.outcome === "FOCUSED" ? [make("small", { textContent: sigma(run.sigma_um) })] : [])),
       make("span", { className: "run-ms tabular", textContent: run.duration_ms === null ? "" : `${Math.round(run.duration_ms)} ms` }),
     );
     button.dataset.run = run.name;
@@ -59,7 +60,7 @@ export function mountRuns(store) {
       $("run-plot").ariaLabel = `The curve of run ${name}, ${run.samples.length} windows`;
       $("run-plot").dataset.points = chart.points();
       say($("run-name"), name);
-      say($("run-reason"), run.result?.reason ?? run.error?.message ?? "");
+      say($("run-reason"), prose(run.result?.reason ?? run.error?.message));
       facts($("run-facts"), run.result ? resultFacts(run.result) : []);
     } catch (error) {
       trouble(error.message);

@@ -10,6 +10,7 @@ export function initial() {
     state: null,
     mode: null,
     fault: null,
+    lease: { mine: false }, // whether this page asked for the rig and was not refused
     cycle: null, // {phase, progress, seen: [phase], result}
     samples: [],
     dropped: 0,
@@ -48,6 +49,8 @@ export function take(state, kind, fields) {
       return { ...state, dropped: state.dropped + fields.count };
     case "stream":
       return { ...state, stream: fields };
+    case "lease":
+      return { ...state, lease: fields };
     case "locked":
       return { ...state, locked: fields.locked };
     default:
@@ -80,6 +83,12 @@ export function mayMove(state) {
 }
 
 export const live = (state) => state.stream.open && state.link.connected;
+
+/** Who keeps the rig and is not this page, or null. */
+export const keeper = (state) => (state.lease.mine ? null : (state.status?.lease.holder ?? null));
+
+/** Whether this page may change anything: it is heard, its user may, and nobody else keeps the rig. */
+export const mayOperate = (state) => live(state) && state.link.role !== "observe" && keeper(state) === null;
 
 /** A store: `send` takes a message, listeners hear of the newest state once a frame. */
 export function createStore(schedule = requestAnimationFrame) {

@@ -5,6 +5,9 @@ const DASH = "–";
 export const um = (value, digits = 2) => (value === null || value === undefined ? DASH : value.toFixed(digits));
 export const sigma = (value) => (value === null || value === undefined ? "" : `± ${value.toFixed(2)}`);
 
+/** A sentence of the daemon as a person reads it: it writes um where µm is meant. */
+export const prose = (text) => String(text ?? "").replaceAll(/(?<=\d\)? )um\b/g, "µm");
+
 export function count(value) {
   if (value === null || value === undefined) return DASH;
   if (value < 1e4) return String(Math.round(value));
@@ -89,7 +92,7 @@ export function readable(word) {
 export function moment(iso, now = new Date()) {
   if (!iso) return DASH;
   const at = new Date(iso);
-  const time = at.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
-  if (at.toDateString() === now.toDateString()) return time;
-  return `${at.toLocaleDateString([], { day: "numeric", month: "short" })} ${time}`;
+  const clock = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" };
+  if (at.toDateString() === now.toDateString()) return at.toLocaleTimeString([], { ...clock, second: "2-digit" });
+  return `${at.toLocaleDateString([], { day: "numeric", month: "short" })}, ${at.toLocaleTimeString([], clock)}`;
 }

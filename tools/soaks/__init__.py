@@ -1,0 +1,1 @@
+"""A long run of the daemon: a day in virtual time, an hour against a service that runs."""
