@@ -30,6 +30,7 @@ from elpd.vision.memory import BuiltImage, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
 from elpd.vision.resting import Resting
 from elpd.vision.saturation import RateWatch
+from elpd.vision.sharpest import Sharpest, sharpest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -195,11 +196,6 @@ class Watch:
     def reference(self) -> Reference:
         """The weights that the region is judged by: the first picture's, or the newest frame's."""
         return self._reference
-
-    @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of this direction of travel so far."""
-        return tuple(self._samples)
 
     @property
     def lit(self) -> bool:
@@ -386,6 +382,10 @@ class Watch:
         """Where the image was sharpest, in the last pass."""
         track = self._memory.track
         return self._sign * track.positions[track.peak]
+
+    def sharpest(self, focus_um: float, distance_um: float) -> Sharpest | None:
+        """Return the picture in focus as the last pass saw it; ``None`` if it saw less than *distance_um* around it."""
+        return sharpest(self._memory, self.roi, self._sign * focus_um, distance_um)
 
     @property
     def gap_near_crossing(self) -> bool:
