@@ -24,6 +24,8 @@ from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, SensorProfile
@@ -170,6 +172,22 @@ class EventMemory:
         change = np.zeros(self._shape, np.int32)
         np.add.at(change, (y[part], x[part]), 2 * on[part].astype(np.int32) - 1)
         return change
+
+    def within(self, roi: Roi) -> tuple[slice, slice]:
+        """Return where a region lies in the remembered images: rows, columns."""
+        top, left = roi.y - self._top, roi.x - self._left
+        return slice(top, top + roi.height), slice(left, left + roi.width)
+
+    def sums(self, weights: NDArray[np.float64], positions: Sequence[float]) -> NDArray[np.float64]:
+        """Return the sum over events of weight times sign, up to where the curve first passed each of *positions*.
+
+        *weights* is (height, width) of the remembered images.
+        """
+        _, x, y, on = (column[: self._count] for column in self._columns)
+        total = np.concatenate([[0.0], np.cumsum(weights[y, x] * (2.0 * on - 1.0))])
+        places, times = np.array(self.track.positions), np.array(self.track.times_us)
+        at = np.array([int(np.argmax(places >= one)) if (places >= one).any() else -1 for one in positions])
+        return np.asarray(total[np.searchsorted(self._t_us, times[at], side="left")])
 
     @property
     def _t_us(self) -> NDArray[np.int64]:
