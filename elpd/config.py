@@ -140,6 +140,8 @@ class ModesSection(_Section):
     found it where it was; after seven without focus the lens rests until somebody asks."""
     settle_s: Positive = 0.3
     """Continuous mode: so long the scene must have been quiet before the lens moves."""
+    recheck_s: Annotated[float, Field(ge=0, le=604_800)] = 0.0
+    """Continuous mode: focus is checked again after so long without a cycle, evidence or not; 0: only with evidence."""
     defocus_dof: Annotated[float, Field(ge=1, le=20)] = 2.0
     """Continuous mode: what counts as out of focus, in depths of focus; half of it counts as in focus again."""
 

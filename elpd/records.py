@@ -129,19 +129,16 @@ class BiasSet(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SensorProfile:
-    """What is known of a sensor from its calibration; ``None`` or empty where it is not.
+    """What focusing takes from a sensor's calibration; ``None`` or empty where it is not known.
 
-    ``hot_pixels`` are (x, y). Noise rates are per pixel. ``lag_us`` is the time constant of the photoreceptors in the
-    brightest parts of a picture, ``lag_sigma_us`` its standard error; it grows in inverse proportion to brightness.
-    ``mismatch`` is the relative standard deviation of the contrast threshold over pixels.
+    ``hot_pixels`` are (x, y). ``lag_us`` is the time constant of the photoreceptors in the brightest parts of a
+    picture, ``lag_sigma_us`` its standard error; it grows in inverse proportion to brightness. Noise rates and the
+    mismatch of thresholds are not among them: a cycle measures both itself, at rest and in the image that events build.
     """
 
     hot_pixels: tuple[tuple[int, int], ...] = ()
-    noise_on_hz: float | None = None
-    noise_off_hz: float | None = None
     lag_us: float | None = None
     lag_sigma_us: float | None = None
-    mismatch: float | None = None
 
 
 # --- what a lens says --------------------------------------------------------------------------------------------

@@ -19,13 +19,14 @@ EPOCH_US = 1_795_388_665_467_217
 class Camera:
     """Whatever is set is noted; whatever is asked for next is what the test put there."""
 
-    def __init__(self) -> None:
+    def __init__(self, model: Any) -> None:
+        self._model = model
         self.said: dict[str, Any] = {}
         self.batches: dict[str, deque[Any]] = {name: deque() for name in ("Event", "Frame", "Imu", "Trigger")}
         self.running = True
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("set"):
+        if name.startswith("set") and hasattr(self._model, name):
             return lambda *values: self.said.update({name.removeprefix("set"): values})
         kind = name.removeprefix("getNext").removesuffix("Batch")
         if kind in self.batches:
@@ -42,8 +43,9 @@ class Camera:
         return answers[name]
 
 
-def source(**settings: Any) -> tuple[DavisSource, Camera]:
-    camera = Camera()
+def source(model: Any = dv.io.camera.DAVIS, **settings: Any) -> tuple[DavisSource, Camera]:
+    """Open a stand-in for one of the library's cameras, which can be told what that one can be told."""
+    camera = Camera(model)
     return DavisSource(camera, dv, DavisSettings.model_validate(settings)), camera
 
 

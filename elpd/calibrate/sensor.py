@@ -84,11 +84,8 @@ class SensorCalibration(Profile):
         """Return what a focus cycle takes from this."""
         return SensorProfile(
             hot_pixels=tuple((one.x, one.y) for one in self.hot_pixels or ()),
-            noise_on_hz=self.noise_on_hz.value,
-            noise_off_hz=self.noise_off_hz.value,
             lag_us=self.lag_us.value,
             lag_sigma_us=self.lag_us.sigma,
-            mismatch=self.mismatch.value,
         )
 
 

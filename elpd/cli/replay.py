@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +60,9 @@ def _request(run: RecordedRun) -> FocusRequest:
     sensor = None
     if asked.sensor is not None:
         known = dict(run.request["sensor"])
-        sensor = SensorProfile(**known | {"hot_pixels": tuple((x, y) for x, y in known["hot_pixels"])})
+        known["hot_pixels"] = tuple((x, y) for x, y in known["hot_pixels"])
+        # Older runs noted more of the calibration than a cycle ever read.
+        sensor = SensorProfile(**{one.name: known[one.name] for one in fields(SensorProfile) if one.name in known})
     roi = Roi(**run.request["roi"]) if asked.roi else None
     return replace(asked, roi=roi, reference=run.attachment("reference"), sensor=sensor)
 

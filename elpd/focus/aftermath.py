@@ -149,6 +149,20 @@ class Aftermath:
         lamp = self._hearing.lamp
         return None if lamp is None else lamp.return_score(self._hearing.memory, self._course.leg.sign * focus_um)
 
+    def sharpened_again(self) -> float | None:
+        """Return how much sharper the image became on the way back, as a share of what it had lost since its peak.
+
+        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once,
+        with the lens at rest.
+        """
+        track = self._hearing.memory.track
+        if not self.scene_moves or self._hearing.lamp is not None or not track.drop > 0.0:
+            return None
+        lost, far = track.drop, track.values[-1]
+        self.catch_up()
+        self._hearing.memory.advance(self._hearing.last_us, track.positions[-1])
+        return (track.values[-1] - far) / lost
+
     # --- where focus was ---
 
     def estimate(self) -> FocusEstimate | None:

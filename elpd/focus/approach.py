@@ -33,7 +33,11 @@ RETURN_SIGMAS = 6.0
 """Under a lamp, how certainly the way back must have undone what the way out had done."""
 
 RETURN_SHARE = 0.5
-"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least."""
+"""The way back leads over the same ground as the end of the way out, and beyond: half its events at the least.
+
+Where the scene moves, events come whether the lens moves or not, and twice as many at one time as at another. There the
+image has to become sharper again by half of what it had lost, which motion does not do to it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +168,16 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
     seen = watch.after.events_back - round(resting_hz * passed_s)
     expected = watch.after.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if score is not None and score >= RETURN_SIGMAS:
+        return seen
+    sharpened = watch.after.sharpened_again()
+    if sharpened is not None:
+        if way_back_um > settings.depth_of_focus_um and sharpened < RETURN_SHARE:
+            raise Ended(
+                Outcome.LENS_DID_NOT_MOVE,
+                f"the controller says that the lens went back {way_back_um:.0f} um, but the image became sharper by "
+                f"{sharpened:.0%} of what it had lost on the way out (at least {RETURN_SHARE:.0%}); check the coupling "
+                "between motor and lens",
+            )
         return seen
     if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
         raise Ended(

@@ -248,16 +248,13 @@ class FocusCycle:
 
     def _search_from_aside(self) -> SweepReport:
         """Go off focus, where the lens began in it, and look for it as from anywhere else: with a picture of there."""
-        turned = self._reversals
         self._stage.listener, self._stage.interrupt = None, self._interrupt
+        self._warnings = []  # the sensor at rest is asked anew
         towards = stand_aside(self._stage, self._settings, int(self._details["sweep_sign"]))
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        try:
-            return self._search(self._arm(reference, roi, picture), towards)
-        finally:
-            self._reversals += turned
+        return self._search(self._arm(reference, roi, picture), towards)
 
     def _search(self, watch: Watch, from_aside: int = 0) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
@@ -274,6 +271,7 @@ class FocusCycle:
             cancelled=self._cancelled,
             interrupt=self._interrupt,
             from_aside=from_aside,
+            reversals=self._reversals,
         )
         try:
             return search.run()

@@ -16,6 +16,7 @@ from elpd.focus.heading import Heading
 from elpd.focus.hearing import Hearing
 from elpd.focus.shedding import Shedding
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.resting import SIGMAS_OF_MOTION, order
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -189,6 +190,11 @@ class Watch:
             if self._rereference is not None:
                 self._hearing.rereference(self._rereference(frame))
         return samples
+
+    @property
+    def sees_a_scene(self) -> bool:
+        """Whether the events of this direction lie together by their sign, as noise alone never does."""
+        return order(self._hearing.memory.change()) > SIGMAS_OF_MOTION
 
     @property
     def passed(self) -> bool:

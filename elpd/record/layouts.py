@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.errors import FormatError, UsageError
+from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.stream import EventStream, open_recording
 from elpd.records import Geometry, Roi
 from elpd.vision.reference import load_image
@@ -45,6 +46,8 @@ _STAMP = re.compile(r"\d+(?:\.\d+)?(?:e\+?\d+)?", re.IGNORECASE)
 _BIN = re.compile(r"^\s*delta_t\s*[:=]\s*(\d+(?:\.\d+)?)", re.IGNORECASE | re.MULTILINE)
 _SENSOR_SIZES = ((128, 128), (240, 180), (346, 260), (304, 240), (640, 480), (1280, 720))
 
+_RARELY = 1_000
+"""One event in so many at the most steps back far where a clock was set back; more often, events are out of order."""
 _MANY = 100
 _LEAST_GAP_US = 1e-3
 """No sensor sends a thousand events in a microsecond."""
@@ -258,6 +261,7 @@ def _assemble(
             f"the sensor's {geometry.width}x{geometry.height} pixels"
         )
     if (np.diff(t_us) < 0).any():
+        _refuse_other_epochs(path, t_us)
         order = np.argsort(t_us, kind="stable")
         notes.append(f"{int((np.diff(t_us) < 0).sum())} time stamps stepped back; the events were sorted")
         t_us, x, y, on = t_us[order], x[order], y[order], on[order]
@@ -292,6 +296,23 @@ def _refuse_seconds(path: Path, t: NDArray[Any]) -> None:
         raise FormatError(
             f"{path}: {t.size} events within {span:.6g} us, in fractions; these are probably seconds: multiply by 1e6"
         )
+
+
+def _refuse_other_epochs(path: Path, t_us: NDArray[np.int64]) -> None:
+    """Refuse a record whose clock was set back: sorted, events of one time would lie among those of another.
+
+    Late packets step back by little, and of a file that is out of order every other event steps back. A clock that is
+    set back does so once in a long while, and far.
+    """
+    back = np.flatnonzero(np.diff(t_us) < -EPOCH_STEP_US)
+    if back.size == 0 or back.size * _RARELY > t_us.size:
+        return
+    first = int(back[0])
+    raise FormatError(
+        f"{path}: the clock was set back {back.size} times by more than {EPOCH_STEP_US} us, first by "
+        f"{int(t_us[first] - t_us[first + 1])} us after {first + 1} of {t_us.size} events (at {int(t_us[first])} us); "
+        "what came before and after belongs to two recordings: keep the events of one of them"
+    )
 
 
 def _size_of(x: NDArray[np.int64], y: NDArray[np.int64], region: tuple[int, int, int, int] | None) -> Geometry:

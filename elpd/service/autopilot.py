@@ -268,7 +268,7 @@ class Autopilot:
 
     def _patience(self) -> modes.Patience:
         section = self._config.modes
-        return modes.Patience(section.hold_off_s, section.settle_s, self._period_s)
+        return modes.Patience(section.hold_off_s, section.settle_s, self._period_s, section.recheck_s)
 
     def _forget(self) -> None:
         self._evidence, self._defocused = None, False

@@ -99,9 +99,12 @@ class BandFocus:
 
 
 def focus_of_bands(
-    position: NDArray[np.float64], log_energies: NDArray[np.float64], half_width: float
+    position: NDArray[np.float64], log_energies: NDArray[np.float64], half_width: float, bands: int = len(BANDS_PX)
 ) -> BandFocus | None:
-    """Fit each band's parabola, (points, bands), and the focus behind them; ``None`` if the finest has no peak."""
+    """Fit each band's parabola, (points, bands), and the focus behind them; ``None`` if the finest has no peak.
+
+    No more than the *bands* finest ones are believed.
+    """
     raw = [fit_vertex(position, log_energies[:, band], half_width) for band in range(len(BANDS_PX))]
     finest = _with_window(raw[0], position, log_energies[:, 0], half_width)
     if raw[0] is None or finest is None:
@@ -109,7 +112,7 @@ def focus_of_bands(
     scatter = float(np.hypot(raw[0].sigma, raw[0].sigma if raw[1] is None else raw[1].sigma))
     bound = DEPARTURE * finest.width
     normal, right, squares, count = np.diag([0.0, 1.0 / bound**2]), np.zeros(2), 0.0, 0
-    for band, f_squared in enumerate(_FREQUENCIES):
+    for band, f_squared in enumerate(_FREQUENCIES[:bands]):
         vertex = _with_window(raw[band], position, log_energies[:, band], half_width)
         row = np.array([1.0, f_squared])
         if vertex is None:

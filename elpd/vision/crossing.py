@@ -11,6 +11,7 @@ here depends on scene, optics or speed. Witnesses that disagree beyond their err
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,7 +21,8 @@ from elpd.records import FocusEstimate
 from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
 from elpd.vision.drift import Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
-from elpd.vision.lag import Lag, average_lag, expected_lag, line_of_classes, weights_of_lines
+from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, weights_of_lines
+from elpd.vision.light import in_focus, worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
 from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
@@ -38,6 +40,11 @@ WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 SYSTEMATIC_IMAGE = 0.04
 SYSTEMATIC_PAIRS = 0.025
 """Standard deviations of what scatter does not show, in widths of the curve (static sweeps, two thresholds)."""
+
+SMOOTH_PAIRS = 0.01
+"""How far, in widths of the curve, midpoints of bright pixels' pairs lie from those of dark ones for other reasons than
+lag, as a standard deviation over a picture's brightness: 27 still sweeps through four lenses have 0.007, and 0.010
+where the lens is aberrated most. Surfaces have their own brightness, and lenses their own focus for each size."""
 
 STILL = 0.1
 """Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
@@ -69,6 +76,10 @@ LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
 
+LAG_UNEXPLAINED_IN_FOCUS = 0.2
+"""The same where the events have told what the picture is in focus: slowness is then right to a tenth, and a receptor's
+delay of a level that turns is its time constant to another one."""
+
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
 
@@ -81,13 +92,21 @@ COARSE_FRAMES = 0.25
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
 
-WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
-"""Thresholds per unit of log intensity that are tried: sensors have 3 to 20, and losses make it more."""
+WORTHS = (2.5, 5.0, 10.0, 20.0, 40.0)
+"""Thresholds per unit of log intensity that are tried where nothing tells: sensors have 3 to 20, and below the dark
+current a unit of log intensity is more light than it seems."""
+
+GHOSTLESS_BANDS = 1
+"""Of a scene that moves, the image that events built from nothing holds the negative of what they began from, which
+stays behind: blurred as that was, it is in the coarse bands, and only the finer ones show the scene alone."""
+
+NEAR_WORTHS = (0.5, 0.71, 1.0, 1.41, 2.0)
+"""What is tried of the worth that the light's conservation tells: from one frame it is right to a factor of two."""
 
 TICKS = 64
 FEWEST_TICKS = 24
 LEVELS_AT_ONCE = 3 << 18
-"""Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt, because a lens waits for them."""
+"""Pixels times ticks of a rebuilt curve: of a large region fewer ticks are rebuilt where a lens waits for them."""
 
 STILL_SHARE = 0.9
 SAMPLE_PX = 1 << 15
@@ -157,6 +176,8 @@ class EventWitnesses:
     """How far the scene went across the sensor meanwhile."""
     expected_lag: Lag = field(default_factory=Lag)
     """What the image would have been freed of if no pair had been asked."""
+    in_focus: bool = False
+    """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
     def witnesses(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> list[Witness]:
         """Return those that are to be believed, with systematic errors included.
@@ -169,6 +190,8 @@ class EventWitnesses:
             return found
         width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
+        if self.in_focus:
+            unexplained = min(unexplained, LAG_UNEXPLAINED_IN_FOCUS)
         shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         stray = _stray(self.pairs)
         departure = 0.0
@@ -198,6 +221,8 @@ def ask_events(
     start: NDArray[np.float32] | None = None,
     calibrated: LagPrior | None = None,
     dark: float = DARK,
+    *,
+    hurried: bool = True,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
@@ -205,6 +230,7 @@ def ask_events(
     photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
     typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
     *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
+    *hurried* says that a lens waits.
     *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
     *brightness* does not show, relative to the brightest parts.
     """
@@ -212,34 +238,47 @@ def ask_events(
     if brightness is None and calibrated is not None:
         calibrated = calibrated.unseen()
     groups = by_pixel(events)
-    at_peak = rebuilt(events, groups, np.array([peak]))[0]
-    slownesses = _slownesses(start, at_peak, slowness)
+    before, at_peak, after = rebuilt(events, groups, np.array([begin, peak, end]))
+    bend = at_peak - 0.5 * (before + after)
+    worth = _worth(start, at_peak, events.margin)
+    worths = WORTHS if worth is None else tuple(one / worth for one in NEAR_WORTHS)
+    slownesses = _slownesses(start, at_peak, slowness, worth, events.margin)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
-    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated)
+    smooth = SMOOTH_PAIRS * flank_width(begin, peak)
+    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth)
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
     if planes:
         depths = tuple(plane.at for plane in planes)
         return EventWitnesses(None, planes[0], late.typical, 0.0, depths, flank_width(begin, peak))
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
         rows = busiest_rows(events, SAMPLE_PX)
-        events, weight, at_peak = rows_of(events, rows), weight[rows], at_peak[rows]
+        events, weight = rows_of(events, rows), weight[rows]
+        at_peak, bend = at_peak[rows], bend[rows]
         slownesses = [one[rows] for one in slownesses]
         start = None if start is None else start[rows]
         groups = by_pixel(events)
     pixels = max(1, events.height * events.width)
-    ticks = np.linspace(begin, end, int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)))
+    count = int(np.clip(LEVELS_AT_ONCE // pixels, FEWEST_TICKS, TICKS)) if hurried else TICKS
+    ticks = np.linspace(begin, end, count)
     images = rebuilt(events, groups, ticks)
     drift = find_drift(images)
-    first = _image_focus(_curves(images, None, weight, events.margin)[0], ticks, peak)
-    curves = [] if _stray(pairs) < STILL else _curves(images, start, weight, events.margin)
+    still = _stray(pairs) < STILL
+    loud = _curves(images, None if still else start, worths, weight, events.margin)
+    first = _image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
-    curves += _curves(images, start, weight, events.margin)
-    candidates = [one for curve in curves if (one := _image_focus(curve, ticks, peak)) is not None]
+    quiet = _curves(images, start, worths, weight, events.margin)
+    bands = [len(BANDS_PX) if still else GHOSTLESS_BANDS, *len(worths) * [len(BANDS_PX)]]
+    curves = quiet if still else loud + quiet
+    candidates = [
+        one
+        for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
+        if (one := _image_focus(curve, ticks, peak, count)) is not None
+    ]
     image = average_focus(candidates) if candidates else None
-    energy = np.square(band_image(at_peak, BANDS_PX[0])) * weight
+    energy, turning = _who_turns(at_peak, bend, weight)
     lags, expected = late.candidates, late.typical
     if energy.any():
-        typical = [float(np.average(slow, weights=energy)) for slow in slownesses]
+        typical = [_typical(slow, turning, energy) for slow in slownesses]
         unasked = _lag_of(None, unmeasured_lag / typical[0], calibrated)
         expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
@@ -248,7 +287,29 @@ def ask_events(
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
-    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected)
+    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=worth is not None)
+
+
+def _who_turns(
+    level: NDArray[np.float32], bend: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where S is at its peak, and which pixels make it fall again; both (height, width).
+
+    S has its energy on both sides of an edge, but it turns where the level of a pixel does, which is the dark side:
+    ``S" = 2·sum of L"·B(A·B·L)``. *bend* stands for L".
+    """
+    band = band_image(level, BANDS_PX[0])
+    weighted = np.asarray(band * weight, dtype=np.float32)
+    return weighted * band, np.asarray(bend * band_image(weighted, BANDS_PX[0]), dtype=np.float32)
+
+
+def _typical(slowness: NDArray[np.float64], turning: NDArray[np.float32], energy: NDArray[np.float32]) -> float:
+    """Return how slow the image is: the mean over what turns, or over its energy where it does not turn as a whole."""
+    by_energy = float(np.average(slowness, weights=energy))
+    total = float(turning.sum())
+    if total <= 0.0:
+        return by_energy
+    return float(np.clip((slowness * turning).sum() / total, slowness.min(), slowness.max()))
 
 
 def _by_brightness(
@@ -263,32 +324,48 @@ def _by_brightness(
     return weight, (1.0 + dark) / (np.maximum(brightness, 0.0).astype(np.float64) + dark)
 
 
-def _slownesses(
-    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
-    """Return candidates of how slow each pixel is: as in the picture, and as it was in focus, by its events.
+def _worth(start: NDArray[np.float32] | None, level: NDArray[np.float32], margin: int) -> float | None:
+    """Return what an event is worth in log intensity, where *level* is what *start* changed by to focus."""
+    return None if start is None else worth_of_an_event(cv2.GaussianBlur(start, (0, 0), 1.0), level, margin)
 
-    A pixel is as slow as the light that it has when it answers, and the start picture was blurred. What its events are
-    worth in log intensity nobody knows.
+
+def _slownesses(
+    start: NDArray[np.float32] | None,
+    level: NDArray[np.float32],
+    slowness: NDArray[np.float64],
+    worth: float | None,
+    margin: int,
+) -> list[NDArray[np.float64]]:
+    """Return candidates of how slow each pixel is: as in the picture in focus, where the *worth* of an event is known.
+
+    A pixel is as slow as the light that it has when it turns, and the start picture was blurred. Where the worth is not
+    known, several are tried, and the picture as it was.
     """
     if start is None:
         return [slowness]
+    if worth is not None:
+        seen = in_focus(cv2.GaussianBlur(start, (0, 0), 1.0), level, worth, margin)
+        return [(1.0 + DARK) / (seen + DARK)]
     found = [slowness]
-    for worth in WORTHS:
+    for one in WORTHS:
         bright = np.maximum(start.astype(np.float64), 0.0) + DARK
-        lit = bright * np.exp(np.clip(level.astype(np.float64) / worth, -5.0, 5.0))
+        lit = bright * np.exp(np.clip(level.astype(np.float64) / one, -5.0, 5.0))
         found.append((1.0 + DARK) / np.clip(lit, DARK, 1.0 + DARK))
     return found
 
 
 def _curves(
-    images: NDArray[np.float32], start: NDArray[np.float32] | None, weight: NDArray[np.float32], margin: int
+    images: NDArray[np.float32],
+    start: NDArray[np.float32] | None,
+    worths: tuple[float, ...],
+    weight: NDArray[np.float32],
+    margin: int,
 ) -> list[NDArray[np.float64]]:
     """Return candidates of log S, (ticks, bands): of the images as they are, and with the start picture below them.
 
     Events count changes since their first; what was there before, the blurred start picture, is missing. In a still
     scene that is as symmetric in defocus as the picture itself. In one that moves, the picture wanders over what is
-    missing, and S wavers. How many thresholds a unit of log intensity is worth nobody knows, so several are tried.
+    missing, and S wavers. What it is worth in events is known roughly at best, so several *worths* are tried.
     """
     own = np.array([band_products(image, image, weight, margin) for image in images])
     curves = [own]
@@ -296,11 +373,13 @@ def _curves(
         below = np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32)
         mixed = np.array([band_products(image, below, weight, margin) for image in images])
         under = band_products(below, below, weight, margin)
-        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in WORTHS]
+        curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in worths]
     return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
 
 
-def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float) -> BandFocus | None:
+def _image_focus(
+    curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float, bands: int = len(BANDS_PX)
+) -> BandFocus | None:
     """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record."""
     end = float(ticks[-1])
     wide = fit_vertex(ticks, curve[:, 0], end - float(ticks[0]))
@@ -309,7 +388,7 @@ def _image_focus(curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: f
     use = ticks <= end - UNANSWERED * wide.width
     if int(use.sum()) < 5:
         return None
-    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width)
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands)
     if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
         return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.
@@ -375,11 +454,14 @@ def _pair_mode(
     slownesses: list[NDArray[np.float64]],
     unmeasured_lag: float,
     calibrated: LagPrior | None,
+    smooth: float,
 ) -> tuple[Mode | None, _Lateness]:
     """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     past = end - peak
-    believed = ((2.0 * pairs.on - 1.0) * curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
+    # Only dark sides of edges: in log intensity they turn sharply, in focus, where bright sides turn far and wide, and
+    # what a lens does to one side of focus and not to the other shows most.
+    believed = (pairs.on > 0) & (curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
     weights = (np.abs(curvature) / gap)[believed]
     middle = pairs.middle[believed]
@@ -387,10 +469,12 @@ def _pair_mode(
     if mode is None:
         unknown = [_lag_of(None, unmeasured_lag / float(one.mean()), calibrated) for one in slownesses]
         return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
-    near = weights * (np.abs(middle - mode.at) <= 2.0 * PAIRS_KERNEL * past)
-    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
-    typical = [float(np.average(one, weights=near)) for one in slow]
-    lines = [line_of_classes(middle, weights, one, mode.at, PAIRS_KERNEL * past) for one in slow]
+    turns = Turns(middle, pairs.after[believed], weights, mode.at, PAIRS_KERNEL * past, smooth)
+    drawn = [turns.line(one[pairs.y, pairs.x][believed]) for one in slownesses]
+    lines = [line for line, _ in drawn]
+    typical = [float(np.average(slow, weights=turns.near)) for _, slow in drawn]
+    # A lag that differs from pixel to pixel spreads their midpoints, which is not to go astray.
+    mode = replace(mode, share=max(mode.share, *(turns.share(line, slow) for line, slow in drawn)))
     # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
     doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
     late = [

@@ -18,12 +18,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from elpd.vision.pairs import weighted_mode
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from elpd.records import SensorProfile
+
+ROUNDS = 4
+"""How often a line is drawn again through midpoints whose lateness it tells itself; two would nearly do."""
 
 UNMEASURED_LAG_US = 1_000.0
 """What a typical pixel's lag may as well exceed as not when nothing tells."""
@@ -44,6 +49,7 @@ _FAR, _CELLS = 6.0, 401
 CLASSES = 10
 FEWEST_CLASSES = 5
 FEWEST_IN_CLASS = 10
+
 NEIGHBOURS = 2.0
 """Classes next to each other share parts of the scene: so many count as one."""
 
@@ -104,10 +110,12 @@ def line_of_classes(
     slowness: NDArray[np.float64],
     mode: float,
     width: float,
+    smooth: float = 0.0,
 ) -> Line | None:
     """Return the line of pairs' midpoints against slowness; ``None`` if there is none.
 
-    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say.
+    *width* is the kernel of the *mode*: pairs further than three of it from their class's middle have no say. *smooth*
+    is the standard deviation of what changes with brightness as smoothly as lag and is none: no scatter shows it.
     """
     order = np.argsort(slowness, kind="stable")
     order = order[np.abs(middle[order] - mode) <= 3.0 * width]
@@ -125,7 +133,55 @@ def line_of_classes(
     x, y = np.array(slow) - np.mean(slow), np.array(late) - np.mean(late)
     slope = float(x @ y / (x @ x))
     variance = float(np.square(y - slope * x).sum()) / (x.size - 2)
-    return Line(slope, sqrt(max(NEIGHBOURS * variance / float(x @ x), 1e-24)), sqrt(variance), x.size)
+
+    scattered = max(NEIGHBOURS * variance / float(x @ x), 1e-24)
+    return Line(slope, sqrt(scattered + smooth**2 / float(np.mean(x * x))), sqrt(variance), x.size)
+
+
+@dataclass(frozen=True, slots=True)
+class Turns:
+    """Mirror pairs that are believed: midpoints, later halves and weights (n,), and the midpoints' mode and kernel."""
+
+    middle: NDArray[np.float64]
+    after: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    mode: float
+    width: float
+    smooth: float = 0.0
+    """As of ``line_of_classes``."""
+
+    @property
+    def near(self) -> NDArray[np.float64]:
+        """The weights of those about the mode."""
+        return np.asarray(self.weights * (np.abs(self.middle - self.mode) <= 2.0 * self.width), dtype=np.float64)
+
+    def line(self, slowness: NDArray[np.float64]) -> tuple[Line | None, NDArray[np.float64]]:
+        """Return the line of midpoints against how late pixels of a *slowness* can be, and how late, (n,).
+
+        A receptor of time constant tau that sees a level fall and rise again evenly is late by
+        ``tau·(1 - exp(-t/tau))`` a time t after the turn: a slow one has not caught up with the rise when its pair is
+        complete, and is less late than its slowness says. How much less depends on the lag that the line is to tell, so
+        it is drawn again. It is believed if the classes then lie closer to it; what something else scatters does not.
+        """
+        near = self.near
+        plain = line = line_of_classes(self.middle, self.weights, slowness, self.mode, self.width, self.smooth)
+        late = slowness
+        for _ in range(ROUNDS):
+            if line is None or line.slope <= 0.0:
+                break
+            focus = self.mode - line.slope * float(np.average(late, weights=near))
+            late = -slowness * np.expm1(-np.maximum(self.after - focus, 0.0) / (line.slope * slowness))
+            line = line_of_classes(self.middle, self.weights, late, self.mode, self.width, self.smooth)
+        if plain is None or line is None or line.scatter > plain.scatter:
+            return plain, slowness
+        return line, late
+
+    def share(self, line: Line | None, late: NDArray[np.float64]) -> float:
+        """Return the part of all weight about the mode, as ``Mode.share``, but for how a line spreads the midpoints."""
+        if line is None:
+            return 0.0
+        freed = weighted_mode(self.middle - line.slope * late, self.weights, self.width)
+        return 0.0 if freed is None else freed.share
 
 
 def expected_lag(line: Line | None, median: float) -> Lag:

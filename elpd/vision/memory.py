@@ -137,6 +137,11 @@ class EventMemory:
         stamp_events(x[part], y[part], on[part], POINT, levels)
         return BuiltImage(levels, self._forgotten + self._count)
 
+    def change(self) -> NDArray[np.float32]:
+        """Return what the events of this memory alone have built, those after the last ``advance`` too."""
+        levels = self.built().levels
+        return levels if self._start is None else levels - self._start.levels
+
     def _make_room(self, count: int) -> None:
         """Let *count* more events fit: forget the oldest of those that the curve has seen, or double the columns."""
         used, capacity = self._count, self._columns[0].size
@@ -221,12 +226,15 @@ class EventMemory:
         deaf_us: float = 0.0,
         start: NDArray[np.float32] | None = None,
         dark: float = DARK,
+        *,
+        hurried: bool = True,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
         show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
-        that the sensor saw when it sent the first of them. ``None`` when there is nothing to ask.
+        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
+        ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
         begin_us, _, sign = ruler.stretch(now_us)
@@ -257,6 +265,7 @@ class EventMemory:
             self._cut(start),
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
             dark,
+            hurried=hurried,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -272,9 +281,9 @@ class EventMemory:
         brightness: NDArray[np.float32] | None = None,
         start: NDArray[np.float32] | None = None,
     ) -> tuple[list[Witness], float | None]:
-        """Return what the events say, on the ruler, and the width of the curve (``None`` if nothing)."""
+        """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start)
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None

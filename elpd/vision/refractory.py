@@ -10,12 +10,13 @@ Nobody knows the period of a given sensor and bias; but no two events of one pix
 it that some nearly are. Just above the period the intervals are evenly spread, so the shortest ones, less what their
 number leaves to expect, are the period, and their scatter its error. Where there is hardly any noise the shortest
 interval is set by the steepest edge in view instead; then the intervals above it crowd, and nothing is learnt but a
-bound.
+bound: the period is anything below it, evenly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,10 +48,13 @@ TOGETHER_US = 16.0
 UNKNOWN_US = 500.0
 """Standard deviation of a period of which nothing is learnt: sensors are set to some tenths of a millisecond."""
 
+MOST_US = 1_000.0
+"""So long a period nobody sets for focusing: a bound above it says nothing more."""
+
 
 @dataclass(frozen=True, slots=True)
 class Refractory:
-    """A refractory period and one standard error, us; both zero where the events say nothing."""
+    """A refractory period and one standard error, us; both zero where the events say nothing at all."""
 
     period_us: float = 0.0
     sigma_us: float = 0.0
@@ -108,13 +112,14 @@ def refractory_period(
     top_us = min(1.5 * least_us, float(shortest_us[-1]))
     above = (shortest_us[ORDER:EVEN_OVER] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
     above = above[: max(FEWEST_ABOVE, int(np.searchsorted(above, 1.0, side="right")))]
-    bound_us = min(0.5 * least_us, UNKNOWN_US)
+    bound_us = min(least_us, MOST_US)
+    only_bounded = Refractory(0.5 * bound_us, bound_us / sqrt(12.0))
     if above.size < FEWEST_ABOVE:
-        return Refractory(0.0, bound_us)
+        return only_bounded
     # Evenly spread, they lie at half their range on average; what is set by edges in view crowds towards its end.
     reach = max(float(above.max()), 1.0 / (top_us - least_us))
     lie = float(above.mean()) / reach
     if reach * (top_us - least_us) > TOGETHER_US and lie > 0.5 + EVEN_SIGMAS / np.sqrt(12.0 * above.size):
-        return Refractory(0.0, bound_us)
+        return only_bounded
     per_us = float(above.size / (reach * (top_us - least_us)))
-    return Refractory(max(0.0, least_us - ORDER / per_us), min(bound_us, float(np.sqrt(ORDER)) / per_us))
+    return Refractory(max(0.0, least_us - ORDER / per_us), min(only_bounded.sigma_us, sqrt(ORDER) / per_us))

@@ -75,6 +75,19 @@ def test_under_a_lamp_a_coupling_that_slips_on_the_return_is_seen() -> None:
     assert story.outcome is Outcome.LENS_DID_NOT_MOVE
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_coupling_that_slips_on_the_return_is_seen_although_the_scene_makes_events_of_its_own(seed: int) -> None:
+    def stick(story: Story) -> None:
+        story.truth.mechanism.stick(story.parts.clock.now_ns())
+
+    shaken = ("sim.motion=shake",)
+    assert meet(seed, *shaken).outcome is not Outcome.LENS_DID_NOT_MOVE
+    story = meet(seed, *shaken, events=(Event("return", 0.0, stick),))
+    assert story.outcome is Outcome.LENS_DID_NOT_MOVE
+    assert story.result is not None
+    assert "sharper" in story.result.reason
+
+
 def test_a_flat_scene_under_a_lamp_has_no_texture() -> None:
     story = meet(2, "sim.flicker_hz=100", "sim.flicker_depth=0.3", "sim.scene=flat")
     assert story.outcome is Outcome.NO_TEXTURE

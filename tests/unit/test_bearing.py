@@ -11,7 +11,7 @@ import pytest
 from elpd.events.decoder import EventArrays
 from elpd.records import Direction, Frame, Geometry, Roi
 from elpd.units import SensorUs
-from elpd.vision.alignment import displacement_px, moved
+from elpd.vision.alignment import displacement_px, laid_on, moved
 from elpd.vision.bearing import Bearing, Gauge, Unrest
 from elpd.vision.integral import band_energy, band_gain, band_patch
 from elpd.vision.memory import EventMemory
@@ -126,6 +126,15 @@ def test_a_picture_is_found_where_events_show_its_gradient(seed: int) -> None:
     change = np.rint(after - before + rng.uniform(-0.5, 0.5, picture.shape)).astype(np.float32)
     found = displacement_px(picture, change)
     assert found == pytest.approx((x_px, y_px), abs=2.0)
+
+
+def test_a_picture_that_is_too_sharp_is_blurred_to_what_moves() -> None:
+    sharp = scene(1.0) / np.float32(4.0)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 3.0)
+    change = np.asarray(moved(soft, 2.5, 0.0) - moved(soft, 1.5, 0.0), np.float32)
+    inside = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+    now = moved(soft, 2.0, 0.0)[inside]
+    assert np.std(laid_on(sharp, change)[inside] - now) < 0.3 * np.std(sharp[inside] - now)
 
 
 def test_without_events_a_picture_is_where_it_was() -> None:

@@ -115,13 +115,24 @@ def test_the_settings_reach_the_camera() -> None:
 
 
 def test_every_method_that_is_called_is_the_library_s_own() -> None:
-    """The camera above agrees to anything; the real class must know each name."""
-    opened, camera = source(exposure_us=700)
-    opened.call("set_window", [None])
-    for name in camera.said:
-        assert hasattr(dv.io.camera.DAVIS, f"set{name}"), name
+    """The stand-in takes only what the real class can be told; what it answers the real one must know, too."""
     for name in ("isRunning", "getEventResolution", "getCameraName", "getSerialNumber", "getNextImuBatch"):
         assert hasattr(dv.io.camera.DAVIS, name), name
+
+
+@pytest.mark.parametrize(
+    ("model", "abilities"), [("DVXplorer", ("window", "trigger", "imu")), ("DVXplorerM", ("window", "imu"))]
+)
+def test_cameras_without_frames_are_told_what_they_know(model: str, abilities: tuple[str, ...]) -> None:
+    opened, camera = source(getattr(dv.io.camera, model))
+    assert opened.facts.abilities == abilities
+    opened.call("set_window", [[10, 20, 30, 40]])
+    assert camera.said["CropArea"] == ((10, 20, 30, 40),)
+    assert ("DetectorRunning" in camera.said) == ("trigger" in abilities)
+    with pytest.raises(ConfigError, match=r"camera\.biases: this camera's biases cannot be set one by one"):
+        source(getattr(dv.io.camera, model), biases={"focus": {"On": (1, 2)}})
+    opened.close()
+    opened.close()
 
 
 def test_an_unplugged_camera_is_an_error() -> None:

@@ -88,6 +88,23 @@ def test_stamps_that_step_back_are_sorted_and_reported(tmp_path: Any) -> None:
     assert "stepped back" in sweep.warnings[0]
 
 
+def test_a_clock_that_was_set_back_is_refused_with_the_place(tmp_path: Any) -> None:
+    t_us = np.concatenate([np.arange(0, 40_000, 20), np.arange(5_000, 45_000, 20)])
+    events = {"x": np.zeros(t_us.size), "y": np.zeros(t_us.size), "p": np.arange(t_us.size) % 2}
+    np.savez(tmp_path / "reset.npz", t=t_us, **events)
+    with pytest.raises(FormatError, match=r"set back 1 times .* by 34980 us after 2000 of 4000 events \(at 39980 us\)"):
+        read_sweep(tmp_path / "reset.npz")
+    # Packets that come late by less than a word of time, and files in no order at all, are sorted.
+    late = np.arange(0, 80_000, 20)
+    late[1000:1100] -= 3_000
+    np.savez(tmp_path / "late.npz", t=late, **events)
+    np.savez(tmp_path / "shuffled.npz", t=np.random.default_rng(1).permutation(t_us), **events)
+    for name in ("late.npz", "shuffled.npz"):
+        sweep = read_sweep(tmp_path / name)
+        assert (np.diff(sweep.t_us) >= 0).all()
+        assert "stepped back" in sweep.warnings[0]
+
+
 @pytest.mark.parametrize(
     "line",
     [

@@ -118,5 +118,5 @@ def test_a_table_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> N
         raise RuntimeError("Access denied (insufficient permissions)")
 
     hal.DeviceDiscovery.open = locked
-    with pytest.raises(CameraError, match="no permission to open it; put the udev rule"):
+    with pytest.raises(CameraError, match="no permission to open it; `elpd check` prints the udev rule"):
         metavision.open_source({})

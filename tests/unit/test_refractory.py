@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -60,8 +61,10 @@ def test_the_steepest_edge_in_view_is_not_taken_for_deafness() -> None:
     order = np.argsort(t.ravel(), kind="stable")
     x, y = (pixel % 40).astype(np.uint16)[order], (pixel // 40).astype(np.uint16)[order]
     found = refractory_period(t.ravel()[order], x, y, (40, 40))
-    assert found.period_us == 0.0
-    assert found.sigma_us > 300
+    shortest_us = float(np.diff(waits.cumsum(axis=1), axis=1).min())
+    assert shortest_us > 600.0
+    assert found.period_us == pytest.approx(0.5 * shortest_us, rel=0.2), "it is anything below, evenly"
+    assert found.sigma_us == pytest.approx(shortest_us / np.sqrt(12.0), rel=0.2)
 
 
 def test_a_grid_of_time_stamps_or_few_events_tell_nothing() -> None:

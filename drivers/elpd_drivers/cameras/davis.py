@@ -113,6 +113,7 @@ class DavisSource:
     def __init__(self, camera: Any, dv: Any, table: DavisSettings) -> None:
         self._camera, self._dv, self._table = camera, dv, table
         self._is_davis = hasattr(camera, "setCropAreaEvents")
+        self._has_detector = hasattr(camera, "setDetectorRunning")  # a DVXplorer Micro has no trigger input
         self._origin_us: int | None = None
         self._newest_us = 0
         self._frames = 0
@@ -126,7 +127,7 @@ class DavisSource:
             serial=str(camera.getSerialNumber()),
             min_latency_us=table.interval_us if table.min_latency_us is None else table.min_latency_us,
             layout=layout_of(EVENTS),
-            abilities=("window", *(("biases",) if self._is_davis else ()), "trigger", "imu"),
+            abilities=tuple(self._abilities()),
         )
 
     def read(self, timeout_s: float) -> Captured | None:
@@ -162,7 +163,7 @@ class DavisSource:
 
     def close(self) -> None:
         """Stop the streams; the library closes the camera when it is forgotten. Idempotent."""
-        if self._camera is not None and self._camera.isRunning():
+        if hasattr(self._camera, "setEventsRunning") and self._camera.isRunning():
             self._camera.setEventsRunning(False)
         self._camera = None
 
@@ -171,13 +172,15 @@ class DavisSource:
     def _configure(self) -> None:
         camera, table = self._camera, self._table
         camera.setTimeInterval(timedelta(microseconds=table.interval_us))
-        camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
+        if hasattr(camera, "setUSBEarlyPacketDelay"):
+            camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
         camera.setImuRunningAccelerometer(True)  # delivered or not, it keeps time in the dark
         camera.setImuRunningGyroscope(True)
         camera.setImuRunningTemperature(True)
-        camera.setDetectorRisingEdges(True)
-        camera.setDetectorFallingEdges(True)
-        camera.setDetectorRunning(table.trigger)
+        if self._has_detector:
+            camera.setDetectorRisingEdges(True)
+            camera.setDetectorFallingEdges(True)
+            camera.setDetectorRunning(table.trigger)
         if not self._is_davis:
             if table.biases != BiasTables():
                 raise ConfigError("camera.biases: this camera's biases cannot be set one by one; remove the table")
@@ -190,6 +193,10 @@ class DavisSource:
             camera.setExposureDuration(timedelta(microseconds=table.exposure_us))
         self._normal = {name: camera.getDavis346BiasCoarseFine(self._bias(name)) for name in self._named()}
         self._set_biases(table.biases.focus)
+
+    def _abilities(self) -> list[str]:
+        has = {"window": True, "biases": self._is_davis, "trigger": self._has_detector, "imu": True}
+        return [name for name, there in has.items() if there]
 
     def _named(self) -> set[str]:
         return {*self._table.biases.expose, *self._table.biases.focus}
