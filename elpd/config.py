@@ -108,7 +108,7 @@ class WebSection(_Section):
 class ServiceSection(_Section):
     """The daemon: how it idles and how it is scheduled."""
 
-    poll_ms: Positive = 20.0
+    poll_ms: Positive = 50.0
     """How often an idle lens is asked where it is."""
     look_s: Positive = 0.1
     """How long an idle camera is listened to at a time."""
@@ -140,6 +140,8 @@ class ModesSection(_Section):
     found it where it was; after seven without focus the lens rests until somebody asks."""
     settle_s: Positive = 0.3
     """Continuous mode: so long the scene must have been quiet before the lens moves."""
+    recheck_s: Annotated[float, Field(ge=0, le=604_800)] = 0.0
+    """Continuous mode: focus is checked again after so long without a cycle, evidence or not; 0: only with evidence."""
     defocus_dof: Annotated[float, Field(ge=1, le=20)] = 2.0
     """Continuous mode: what counts as out of focus, in depths of focus; half of it counts as in focus again."""
 

@@ -21,8 +21,11 @@ import sysconfig
 import tempfile
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+
+import pytest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -40,6 +43,7 @@ _NEEDED = (
 )
 _UNSHARE = ("unshare", "--pid", "--fork", "--mount", "--net", "--ipc", "--uts", "--cgroup", "--propagation", "private")
 _BOOT_S = 30.0
+MEMORY = Path("/sys/fs/cgroup/memory")
 
 _BOOT = r"""
 set -eu
@@ -219,6 +223,30 @@ class Booted:
             time.sleep(0.03)
         return answer
 
+    @contextmanager
+    def starved(self, unit: str) -> Iterator[Callable[[], bool]]:
+        """Give a unit's processes no page of memory more; what is yielded says whether one was killed for it.
+
+        Skips the test where there is no memory cgroup (of version 1) to be had.
+        """
+        place = MEMORY / self.folder.name
+        try:
+            place.mkdir()
+        except OSError:
+            pytest.skip("no memory cgroup of our own here")
+        try:
+            (place / "memory.limit_in_bytes").write_text("64K", encoding="ascii")
+            for pid in self._cgroup_of(unit).read_text(encoding="ascii").split():
+                (place / "cgroup.procs").write_text(pid, encoding="ascii")
+            yield lambda: "oom_kill 0" not in (place / "memory.oom_control").read_text(encoding="ascii")
+        finally:
+            for pid in (place / "cgroup.procs").read_text(encoding="ascii").split():
+                (MEMORY / "cgroup.procs").write_text(pid, encoding="ascii")
+            self.until(lambda: _removed(place), "the memory cgroup to be left")
+
+    def _cgroup_of(self, unit: str) -> Path:
+        return next(path for path in self._cgroup.rglob("cgroup.procs") if path.parent.name == unit)
+
     def __exit__(self, *_: object) -> None:
         if self._init is not None:
             _kill(self._init)
@@ -300,6 +328,14 @@ def cgroups() -> Path:
     """Return where cgroups of version 2 are."""
     unified = Path("/sys/fs/cgroup/unified")
     return unified if unified.is_dir() else Path("/sys/fs/cgroup")
+
+
+def _removed(folder: Path) -> bool:
+    try:
+        folder.rmdir()
+    except OSError:  # a dying process is still in it
+        return False
+    return True
 
 
 def _children(pid: int) -> Iterator[int]:

@@ -19,6 +19,7 @@ from elpd.service.messages import (
     MetricsAnswer,
     MoveAnswer,
     Params,
+    Result,
     Status,
     StopAnswer,
 )
@@ -72,6 +73,8 @@ class FakeEngine:
         self.departed: list[Caller] = []
         self.changes: dict[str, Any] = {}
         """What the status says otherwise than usual."""
+        self.answers: dict[str, Result] = {}
+        """What is answered to methods by name."""
         self.patient = False
         """Whether to answer nothing before the test says so."""
         self.beats = 0
@@ -97,6 +100,8 @@ class FakeEngine:
             self.accepted.append(ticket)
         elif self.patient:
             self.waiting.append(ticket)
+        elif request.method in self.answers:
+            ticket.finish(Answer(self.answers[request.method]))
         else:
             ticket.finish(Answer(MetricsAnswer(text="elpd_up 1\n")))
         self._note(request.method)

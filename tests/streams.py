@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from elpd.events.lanes import available
+from elpd.events.simd import available
 from elpd.events.stream import EventStream, open_recording
 
 needs_lanes = pytest.mark.skipif(not available(), reason="this processor has no AVX-512")

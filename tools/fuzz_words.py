@@ -21,9 +21,9 @@ import numpy as np
 
 from elpd.events.evt2 import decode_evt2, decode_evt21
 from elpd.events.evt3 import decode
-from elpd.events.evt3_lanes import EVENTS, LISTS
-from elpd.events.lanes import available
+from elpd.events.evt3_lists import EVENTS, LISTS
 from elpd.events.registers import new_state
+from elpd.events.simd import available
 from elpd.events.stream import open_recording
 from elpd.records import Encoding
 from elpd.vision import elp_addresses, elp_lanes, elp_words

@@ -280,7 +280,7 @@ def realtime() -> Iterator[str | None]:
     except PermissionError:
         yield "SCHED_FIFO was refused (needs CAP_SYS_NICE or LimitRTPRIO)"
         return
-    libc.mlockall(3)
+    libc.mlockall(7)  # as the service does: what is touched stays
     gc.collect()
     gc.freeze()
     gc.disable()

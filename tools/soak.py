@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -51,6 +52,7 @@ def main() -> int:
 def _day(chosen: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory:
         day = Day(chosen.seed, Path(directory))
+        _end_early(day)
         day.run(24.0 if chosen.hours is None else chosen.hours, chosen.cycles)
         day.finish()
         return day.figures()
@@ -58,8 +60,19 @@ def _day(chosen: argparse.Namespace) -> dict[str, Any]:
 
 def _hour(chosen: argparse.Namespace) -> dict[str, Any]:
     hour = Hour(chosen.service, chosen.seed)
+    _end_early(hour)
     hour.run(1.0 if chosen.hours is None else chosen.hours)
     return hour.figures()
+
+
+def _end_early(run: Day | Hour) -> None:
+    """Let Ctrl-C and SIGTERM end a run in order, with the figures so far."""
+
+    def enough(*_: object) -> None:
+        run.enough = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, enough)
 
 
 def _print(name: str, value: Any) -> None:

@@ -17,6 +17,7 @@ from serial.tools import list_ports
 
 from elpd.errors import DeviceError
 from elpd.ports import FoundDevice
+from elpd_drivers.cameras.process import CHILD
 from elpd_drivers.cameras.refusals import UDEV_FILE, udev_rule
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ CAMERAS = {
     (0x1409, 0x8E00): ("IDS uEye XCP-E", PROPHESEE),
 }
 """Vendor and product numbers of the makers' udev rules. Cypress' 04b4 is shared with other FX3 devices."""
+
+INSTALLED_RULES = Path("/etc/udev/rules.d/70-elpd.rules")
+"""Where ``tools/install`` puts the rules of a whole installation."""
 
 INIVATION = 0x152A
 _INIVATION_PRODUCTS = range(0x8400, 0x8420)
@@ -117,18 +121,27 @@ def _camera(device: Any) -> FoundDevice:
     assert known is not None, "only known cameras are listed"
     name, backends = known
     node = Path(f"/dev/bus/usb/{device.bus or 0:03d}/{device.address or 0:03d}")
-    rule = udev_rule(device.idVendor)
     installed = [backend.driver for backend in backends if find_spec(backend.package) is not None]
-    next_step = _in_the_way(node, f"put this line into {UDEV_FILE} and plug it in again: {rule}")
-    if next_step is None and not installed:
-        next_step = f"no driver for it is installed: {' or '.join(backend.install for backend in backends)}"
+    steps = []
+    if not installed:
+        steps.append(f"no driver for it is installed: {' or '.join(backend.install for backend in backends)}")
+    in_the_way = _in_the_way(node, _permission(device.idVendor))
+    if in_the_way is not None:
+        steps.append(in_the_way)
     return FoundDevice(
         kind="camera",
         name=f"{name} ({device.idVendor:04x}:{device.idProduct:04x})",
         where=str(node),
-        next_step=next_step,
+        next_step="\n".join(steps) or None,
         drivers=tuple(installed),
     )
+
+
+def _permission(vendor: int) -> str:
+    """Say how a person gets to open a maker's cameras; what is to be typed stands on a line of its own."""
+    if INSTALLED_RULES.exists():
+        return "add yourself to its group (`ls -l` shows it, usually elpd), log in anew, or ask the daemon"
+    return f"type this, then plug it in again:\necho '{udev_rule(vendor)}' | sudo tee {UDEV_FILE}"
 
 
 def _known(device: Any) -> tuple[str, tuple[Backend, ...]] | None:
@@ -146,14 +159,22 @@ def _in_the_way(node: Path, remedy: str) -> str | None:
 
 
 def _holder(node: Path, processes: Path = Path("/proc")) -> str | None:
-    """Name another process that has *node* open, as far as this user may know."""
+    """Name a process of others that has *node* open, as far as this user may know; elpd itself is in nobody's way."""
     for process in processes.glob("[0-9]*"):
         if process.name == str(os.getpid()):
             continue
         try:
             if any(link.readlink() == node for link in (process / "fd").iterdir()):
+                if _is_ours((process / "cmdline").read_bytes()):
+                    continue
                 name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
                 return f"{name} (process {process.name})"
         except OSError:
             continue  # it has ended, or it is somebody else's
     return None
+
+
+def _is_ours(command: bytes) -> bool:
+    """Say whether a command line is elpd's, or that of the process that reads a camera for it."""
+    words = command.decode(errors="replace").split("\0")
+    return CHILD in words or any(Path(word).name == "elpd" for word in words[:2]) or words[1:3] == ["-m", "elpd"]

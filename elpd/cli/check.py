@@ -80,9 +80,10 @@ def tell(findings: list[Finding]) -> None:
         click.echo(f"  {status}{finding.name:{width}s}  {finding.found}")
         if finding.next_step is not None:
             indent = " " * (width + 12)
+            told, *to_type = finding.next_step.splitlines()
             click.echo(
                 textwrap.fill(
-                    finding.next_step,
+                    told,
                     _STEP_WIDTH,
                     initial_indent=f"{indent}-> ",
                     subsequent_indent=f"{indent}   ",
@@ -90,3 +91,5 @@ def tell(findings: list[Finding]) -> None:
                     break_on_hyphens=False,
                 )
             )
+            for line in to_type:  # whole, so that it can be copied
+                click.echo(f"{indent}   {line}")

@@ -26,6 +26,13 @@ if TYPE_CHECKING:
 DRIVER_GROUPS = ("elpd.rigs", "elpd.cameras", "elpd.lenses", "elpd.apertures", "elpd.formats", "elpd.boards")
 DISCOVERY_GROUP = "elpd.discovery"
 
+DRIVER_KEYS = {"camera": "camera.driver", "serial port": "lens.driver"}
+NOTHING_FOUND = {
+    "usb": ("no event camera", "for a real one: check its cable and power; `lsusb` lists all that this machine sees"),
+    "serial": ("no serial port", "for a real lens: plug its controller in; `dmesg` tells why it does not come up"),
+}
+"""Of our own discoveries: what is not there, and what to do about it. The simulated rig needs neither."""
+
 KERNEL_ROOMS = ("elpd.events", "elpd.vision")
 
 _MCL_CURRENT_ON_FAULT = 1 | 4  # lock what is there, but do not page everything in just to find out
@@ -125,7 +132,8 @@ def devices() -> list[Finding]:
             findings.append(Finding("devices", point.name, Status.NOTE, f"cannot look: {error}"))
             continue
         if not found:
-            findings.append(Finding("devices", point.name, Status.NOTE, "nothing found"))
+            found_none, step = NOTHING_FOUND.get(point.name, ("nothing found", None))
+            findings.append(Finding("devices", point.name, Status.NOTE, found_none, step))
         for device in found:
             data = {
                 "kind": device.kind,
@@ -134,7 +142,8 @@ def devices() -> list[Finding]:
                 "drivers": list(device.drivers),
             }
             status = Status.OK if device.next_step is None else Status.PROBLEM
-            opened_by = f", driver = {' or '.join(device.drivers)}" if device.drivers else ""
+            key = DRIVER_KEYS.get(device.kind, "driver")
+            opened_by = f", {key} = {' or '.join(device.drivers)}" if device.drivers else ""
             told = f"{device.where}  {device.name}{opened_by}"
             findings.append(Finding("devices", device.kind, status, told, device.next_step, data))
     return findings

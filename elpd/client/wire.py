@@ -34,15 +34,23 @@ _ERRORS: dict[str, type[ElpdError]] = {
 def socket_path(given: str | Path | None = None) -> Path:
     """Say where the daemon listens: *given*, ``ELPD_SOCKET``, the system's socket if there is one, else the user's.
 
-    Raises ``UsageError`` for a path longer than a socket's may be.
+    Where there is none yet, it is where a daemon of this user would make one. Raises ``UsageError`` for a path longer
+    than a socket's may be.
     """
     path = Path(given or os.environ.get("ELPD_SOCKET") or SYSTEM_SOCKET)
-    if not given and not os.environ.get("ELPD_SOCKET") and not SYSTEM_SOCKET.exists():
-        runtime = os.environ.get("XDG_RUNTIME_DIR")
-        path = Path(runtime, "elpd", "elpd.sock") if runtime else SYSTEM_SOCKET
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if not given and not os.environ.get("ELPD_SOCKET") and not SYSTEM_SOCKET.exists() and runtime:
+        users = Path(runtime, "elpd", "elpd.sock")
+        path = users if users.exists() or not may_make(SYSTEM_SOCKET) else SYSTEM_SOCKET
     if len(os.fsencode(path)) > LONGEST_PATH:
         raise UsageError(f"{path}: a socket's path may have {LONGEST_PATH} bytes; choose a shorter one")
     return path
+
+
+def may_make(socket: Path) -> bool:
+    """Say whether a daemon of this user could make a socket there."""
+    place = socket.parent
+    return os.access(place if place.exists() else place.parent, os.W_OK | os.X_OK)
 
 
 def request_line(number: int, method: str, params: dict[str, Any]) -> bytes:

@@ -11,11 +11,13 @@ import numpy as np
 
 from elpd.events.decoder import WordDecoder
 from elpd.events.evt3 import WORDS, Evt3Decoder, decode, skip_to_time
-from elpd.events.evt3_lanes import AHEAD, BLOCKS, EVENTS, LEDGER, LISTS, LOWS, take_change_of_time, take_timed_blocks
+from elpd.events.evt3_lanes import AHEAD, take_change_of_time, take_timed_blocks
+from elpd.events.evt3_lists import COLUMNS, EVENTS, LEDGER_SIZE, LISTS, LOWS, ROWS
 from elpd.events.jit import kernel
-from elpd.events.lanes import available, unpack
+from elpd.events.lanes_columns import unpack
 from elpd.events.registers import EVENTS as EVENTS_SEEN
-from elpd.events.registers import HIGH, LOOP, NO_ROW, X_OUT_OF_RANGE, Y_OUT_OF_RANGE
+from elpd.events.registers import HIGH, LOOP, X_OUT_OF_RANGE, Y_OUT_OF_RANGE
+from elpd.events.simd import available
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
     from elpd.events.decoder import DecodeKernel
     from elpd.records import Geometry
 
-ROW_LENGTH = 4096  # of the addresses in a list, as ``unpack`` takes them apart
 ALL_LOWS = 4096
 
 
@@ -57,11 +58,9 @@ if available():  # elsewhere it does not compile
             if n + EVENTS > out_t.shape[0]:
                 return position, n
             base = (state[LOOP] << 24) + (state[HIGH] << 12)
-            position, listed, stopped = take_timed_blocks(
-                words, position, state, triggers, 0, ALL_LOWS, NO_ROW, ROW_LENGTH, lists, ledger
-            )
+            position, listed, stopped = take_timed_blocks(words, position, state, triggers, 0, ALL_LOWS, lists, ledger)
             written, no_row, no_column = unpack(
-                lists, LOWS, listed, base, width, height, out_t[n:], out_x[n:], out_y[n:], out_p[n:]
+                lists, COLUMNS, ROWS, LOWS, listed, base, width, height, out_t[n:], out_x[n:], out_y[n:], out_p[n:]
             )
             n += written
             state[EVENTS_SEEN] += written
@@ -80,7 +79,7 @@ class Evt3BlockDecoder(WordDecoder):
     """Decode EVT3 words (uint16), in pieces of any size, to arrays, with AVX-512. See ``WordDecoder``."""
 
     def __init__(self, geometry: Geometry) -> None:
-        scratch = (np.zeros(LISTS, np.uint32), np.zeros(BLOCKS * LEDGER, np.int64))
+        scratch = (np.zeros(LISTS, np.uint32), np.zeros(LEDGER_SIZE, np.int64))
 
         def run(*arguments: Any) -> Any:
             return decode_blocks(*arguments, *scratch)  # type: ignore[call-arg]  # *arguments is one to it

@@ -17,28 +17,48 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elpd.events.bits import trailing_zeros
-from elpd.events.evt3 import take_rare_words
+from elpd.events.evt3 import take_rare_word
+from elpd.events.evt3_lists import (
+    BLOCKS,
+    COLUMNS,
+    COPIED,
+    LANE_LOWS,
+    LANE_ROWS,
+    LEDGER,
+    LOWS,
+    PLACES,
+    RANK,
+    ROWS,
+    SETTLED,
+    STOPPED,
+    X_COLUMNS,
+    X_LOWS,
+    X_MASK,
+    X_ROWS,
+)
+from elpd.events.evt3_others import TRIPLE, TRIPLE_KINDS, is_whole, join_triple, settle_last, settle_others
 from elpd.events.jit import kernel
 from elpd.events.lanes import (
-    LANES,
-    addresses,
     copy_run,
+    count,
+    entry,
     fill_run,
     four_words,
+    highest,
     kinds,
     pack,
     pack_places,
     pack_run,
-    population,
-    times,
+    pack_words,
+    spread,
+    take_counts,
 )
 from elpd.events.registers import (
     HIGH,
     LOOP,
     LOW,
     MAX_SIDE,
-    NO_SUBTYPE,
-    OTHERS_SUBTYPE,
+    OTHERS,
     RATE_AFTER,
     RATE_BEFORE,
     RATE_COUNTS,
@@ -47,6 +67,7 @@ from elpd.events.registers import (
     VECTOR_X,
     Integer,
 )
+from elpd.events.simd import LANES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -56,33 +77,15 @@ if TYPE_CHECKING:
 AHEAD = LANES + 3
 """Words that must follow for a block to be taken: a triple may begin with its last word."""
 
-BLOCKS = 32
-EVENTS = 12 * (LANES * BLOCKS + 3) + LANES
-"""Room for a list of events: all that so many blocks can hold, and what a vector store touches beyond."""
-
-LANE_WORDS = LANES * (BLOCKS + 1)
-LOWS, OF_X, OF_X_LOWS, AT_LANES = EVENTS, 2 * EVENTS, 3 * EVENTS, 4 * EVENTS
-LANE_LOWS, PLACES = AT_LANES + LANE_WORDS, AT_LANES + 2 * LANE_WORDS
-LISTS = AT_LANES + 3 * LANE_WORDS
-"""Scratch memory is one array of this size, because a kernel pays for each that it cuts: lists of events and of their
-times, the same for ADDR_X alone, what each lane would mean, its time, and the places of words that need a look."""
-
-X_MASK, RANK, LEDGER = 0, 1, 2
-
-TRIPLE = np.uint64(0x5000_4000_4000_3000)
-TRIPLE_KINDS = np.uint64(0xF000_F000_F000_F000)
-RATE = np.uint64(0x7000_F000_F000_E014)
-RATE_KINDS = np.uint64(0xF000_F000_F000_FFFD)  # one bit says whether before or after the controller
-
 
 @kernel()
-def low_before(words: NDArray[np.uint16], place: Any, position: int, low: Any) -> Any:
-    """Return the low part of time that holds at *place*, if it was *low* at *position*."""
+def content_before(words: NDArray[np.uint16], place: Any, position: int, kind: int, otherwise: Any) -> Any:
+    """Return what the nearest word of a *kind* before *place* says; *otherwise* if there is none since *position*."""
     while place > position:
         place -= 1
-        if words[place] >> 12 == 0x6:
+        if words[place] >> 12 == kind:
             return np.int64(words[place]) & 0xFFF
-    return low
+    return otherwise
 
 
 @kernel()
@@ -98,6 +101,79 @@ def take_change_of_time(word: Integer, state: NDArray[np.int64]) -> None:
     state[LOW] = 0
 
 
+@kernel()
+def copy_x(lists: NDArray[np.uint32], begin: Any, end: Any, n: Any) -> None:
+    """Append the events of ADDR_X words, from one to another, to the list of all events."""
+    copy_run(lists, X_COLUMNS + begin, lists, COLUMNS + n, end - begin)
+    copy_run(lists, X_ROWS + begin, lists, ROWS + n, end - begin)
+    copy_run(lists, X_LOWS + begin, lists, LOWS + n, end - begin)
+
+
+def _build_rest(timed: bool) -> Callable[..., Any]:  # noqa: FBT001  (a compile-time constant)
+    @kernel()
+    def take_rest(
+        words: NDArray[np.uint16],
+        position: int,
+        state: NDArray[np.int64],
+        triggers: NDArray[np.int64],
+        n: Any,
+        n_places: int,
+        lists: NDArray[np.uint32],
+        ledger: NDArray[np.int64],
+    ) -> Any:
+        base = (state[LOOP] << 24) + (state[HIGH] << 12)
+        vector_x, vector_on = state[VECTOR_X], state[VECTOR_ON]
+        copied: Any = 0
+        settled: Any = 0
+        for j in range(n_places):
+            lane = entry(lists, PLACES + j)
+            place = position + lane
+            four = four_words(words, place)
+            mask = np.uint32(0)
+            width = 0
+            if four & TRIPLE_KINDS == TRIPLE:
+                vector_x = np.int64(four & np.uint64(0x7FF))
+                vector_on = np.int64((four >> np.uint64(11)) & np.uint64(1))
+                mask, width = join_triple(four), 32
+            else:
+                word = np.int64(four & np.uint64(0xFFFF))
+                kind = word >> 12
+                if kind == 0x3:
+                    vector_x, vector_on = word & 0x7FF, (word >> 11) & 1
+                elif kind == 0x4:
+                    mask, width = np.uint32(word & 0xFFF), 12
+                elif kind == 0x5:
+                    mask, width = np.uint32(word & 0xFF), 8
+                else:
+                    settle_others(words, position, settled, lane, state)
+                    settled = lane + 1
+                    now = content_before(words, place, position, 0x6, state[LOW])
+                    take_rare_word(word, base + now, state, triggers)
+            if width > 0:
+                if timed:
+                    block = lane // LANES * LEDGER
+                    before = np.uint32((np.uint64(1) << np.uint64(lane % LANES)) - np.uint64(1))
+                    rank = ledger[block + RANK] + count(np.uint32(ledger[block + X_MASK]) & before)
+                    copy_x(lists, copied, rank, n)
+                    n += rank - copied
+                    copied = rank
+                    fill_run(entry(lists, LANE_LOWS + lane), lists, LOWS + n)
+                pack_run(vector_x, vector_on, mask, lists, COLUMNS + n)
+                fill_run(entry(lists, LANE_ROWS + lane), lists, ROWS + n)
+                n += count(mask)
+                # A base outside every sensor need not grow: it would overflow in the end.
+                vector_x = min(vector_x + width, 2 * MAX_SIDE)
+        state[VECTOR_X], state[VECTOR_ON] = vector_x, vector_on
+        ledger[COPIED], ledger[SETTLED] = copied, settled
+        return n
+
+    return take_rest
+
+
+_take_rest = _build_rest(timed=False)
+_take_timed_rest = _build_rest(timed=True)
+
+
 def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001  (a compile-time constant)
     @kernel()
     def take_blocks(
@@ -107,114 +183,89 @@ def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001
         triggers: NDArray[np.int64],
         low_from: int,
         low_until: int,
-        last_row: int,
-        stride: int,
         lists: NDArray[np.uint32],
         ledger: NDArray[np.int64],
     ) -> tuple[int, int, bool]:
-        of_x, of_x_lows = (OF_X, OF_X_LOWS) if timed else (0, LOWS)
-        high, low, row = state[HIGH], state[LOW], state[ROW]
-        first_low = low
-
+        columns, rows, lows = (X_COLUMNS, X_ROWS, X_LOWS) if timed else (COLUMNS, ROWS, LOWS)
+        high = state[HIGH]
         n_x: Any = 0
+        n_others: Any = 0
+        n_counts: Any = 0
+        last_count, last_other, last_low, last_row = -1, -1, -1, -1  # lanes
         n_places, b = 0, 0
         end: Any = LANES
         at: Any = position
+        row_before, continued = np.uint32(0), np.uint32(0)
         while b < BLOCKS and at + AHEAD <= words.shape[0] and end == LANES:
-            x_mask, y_mask, low_mask, odd, stop = kinds(words, at, high, low_from, low_until)
-            end = np.int64(trailing_zeros(stop))
-            taken = np.uint32((np.uint64(1) << np.uint64(end)) - np.uint64(1))
+            x, y, low, stop, vector, other, counted, triples, edge, odd = kinds(words, at, high, low_from, low_until)
+            taken = np.uint32(0xFFFF_FFFF)
+            if stop != 0:
+                end = np.int64(trailing_zeros(stop))
+                taken = np.uint32((np.uint64(1) << np.uint64(end)) - np.uint64(1))
+                # A store keeps this a branch: as a selection the next block would wait for this one's words.
+                ledger[STOPPED] = end
             begin = b * LANES
-            row = addresses(words, at, y_mask & taken, row, last_row, stride, lists, AT_LANES + begin)
-            pack(lists, AT_LANES + begin, x_mask & taken, lists, of_x + n_x)
+            x, y, low, other, odd = x & taken, y & taken, low & taken, other & taken, odd & taken
+            if edge & taken != 0:
+                for lane in range(LANES - 3, LANES):
+                    if (edge & taken) >> np.uint32(lane) & np.uint32(1):
+                        count_there, triple_there = is_whole(words, at + lane)
+                        counted |= np.uint32(count_there) << np.uint32(lane)
+                        triples |= np.uint32(triple_there) << np.uint32(lane)
+            # Mostly each ADDR_X has a row of its own, right before it.
+            if x & ~(y << np.uint32(1) | row_before) & np.uint32(0xFFFF_FFFF) | vector & taken == 0:
+                pack_words(words, at - 1, np.uint32(x), lists, rows + n_x)
+            else:
+                row = np.int64(words[position + last_row]) if last_row >= 0 else state[ROW]
+                spread(words, at, np.uint32(y), row, lists, LANE_ROWS + begin)
+                pack(lists, LANE_ROWS + begin, np.uint32(x), lists, rows + n_x)
+            pack_words(words, at, np.uint32(x), lists, columns + n_x)
             if timed:
-                low = times(words, at, low_mask & taken, low, lists, LANE_LOWS + begin)
-                pack(lists, LANE_LOWS + begin, x_mask & taken, lists, of_x_lows + n_x)
-                ledger[b * LEDGER + X_MASK], ledger[b * LEDGER + RANK] = x_mask, n_x
-            n_x += population(x_mask & taken)
-            pack_places(begin, odd & taken, lists, PLACES + n_places)
-            n_places += population(odd & taken)
+                now = np.int64(words[position + last_low]) if last_low >= 0 else state[LOW]
+                spread(words, at, np.uint32(low), now & 0xFFF, lists, LANE_LOWS + begin)
+                pack(lists, LANE_LOWS + begin, np.uint32(x), lists, lows + n_x)
+                ledger[b * LEDGER + X_MASK], ledger[b * LEDGER + RANK] = x, n_x
+            n_x += count(np.uint32(x))
+            last_row = begin + highest(np.uint32(y)) if y != 0 else last_row
+            last_low = begin + highest(np.uint32(low)) if low != 0 else last_low
+            row_before = y >> np.uint32(31)
+            counted &= taken
+            last_count = begin + highest(np.uint32(counted)) if counted != 0 else last_count
+            last_other = begin + highest(np.uint32(other)) if other != 0 else last_other
+            n_counts += count(np.uint32(counted))
+            n_others += count(np.uint32(other))
+            # A time that stops a block does not stand within a phrase, so what reaches beyond reaches the next block.
+            within = np.uint64((counted | triples) & taken) * np.uint64(0b1110)
+            rest = np.uint32(odd & ~(within | np.uint64(continued) | np.uint64(other)))
+            continued = np.uint32(within >> np.uint64(LANES))
+            pack_places(begin, rest, lists, PLACES + n_places)
+            n_places += count(rest)
             at += end
             b += 1
-        if not timed:
-            low = low_before(words, at, position, low)
+        at += 1 + highest(continued)
 
-        base = (state[LOOP] << 24) + (high << 12)
-        vector_x, vector_on = state[VECTOR_X], state[VECTOR_ON]
+        if n_counts > 0:
+            n_places, before, after = take_counts(words, position, lists, PLACES, n_places)
+            state[RATE_BEFORE] += before
+            state[RATE_AFTER] += after
+            state[RATE_COUNTS] += n_counts
         n = 0 if timed else n_x
-        copied = 0
-        j = np.uint64(0)
-        rate_before = rate_after = rate_counts = np.int64(0)
-        while j < n_places:
-            lane = np.int64(lists[np.uint64(PLACES) + j])
-            place = position + lane
-            four = four_words(words, place)
-            mask = np.uint32(0)
-            size: Any = 1
-            columns = 0
-            if four & TRIPLE_KINDS == TRIPLE:
-                vector_x = np.int64(four & np.uint64(0x7FF))
-                vector_on = np.int64((four >> np.uint64(11)) & np.uint64(1))
-                mask = np.uint32(
-                    ((four >> np.uint64(16)) & np.uint64(0xFFF))
-                    | ((four >> np.uint64(20)) & np.uint64(0xFFF000))
-                    | ((four >> np.uint64(24)) & np.uint64(0xFF000000))
-                )
-                size, columns = 4, 32
-            elif four & RATE_KINDS == RATE:
-                count = (
-                    ((four >> np.uint64(16)) & np.uint64(0xFFF))
-                    | ((four >> np.uint64(20)) & np.uint64(0xFFF000))
-                    | ((four >> np.uint64(24)) & np.uint64(0xF000000))
-                )
-                after = -np.int64((four >> np.uint64(1)) & np.uint64(1))
-                rate_after += np.int64(count) & after
-                rate_before += np.int64(count) & ~after
-                rate_counts += 1
-                state[OTHERS_SUBTYPE] = NO_SUBTYPE
-                size = 4
+        if n_places > 0:
+            if timed:
+                n = _take_timed_rest(words, position, state, triggers, n, n_places, lists, ledger)
             else:
-                word = np.int64(four & np.uint64(0xFFFF))
-                kind = word >> 12
-                if kind == 0x3:
-                    vector_x, vector_on = word & 0x7FF, (word >> 11) & 1
-                elif kind == 0x4:
-                    mask, columns = np.uint32(word & 0xFFF), 12
-                elif kind == 0x5:
-                    mask, columns = np.uint32(word & 0xFF), 8
-                else:
-                    now = np.int64(lists[LANE_LOWS + lane]) if timed else low_before(words, place, position, first_low)
-                    begun = np.uint64(place)
-                    after_rare = take_rare_words(words, begun + np.uint64(1), base + now, state, triggers)
-                    size = np.int64(after_rare - begun)
-            if columns > 0:
-                if timed:
-                    block = lane // LANES * LEDGER
-                    before = np.uint32((np.uint64(1) << np.uint64(lane % LANES)) - np.uint64(1))
-                    rank = ledger[block + RANK] + population(np.uint32(ledger[block + X_MASK]) & before)
-                    copy_run(lists, of_x + copied, lists, n, rank - copied)
-                    copy_run(lists, of_x_lows + copied, lists, LOWS + n, rank - copied)
-                    n += rank - copied
-                    copied = rank
-                    fill_run(np.int64(lists[LANE_LOWS + lane]), lists, LOWS + n)
-                # A lane's address is its row's, and what its word would add were it an ADDR_X.
-                word = np.int64(four & np.uint64(0xFFFF))
-                offset = np.int64(lists[AT_LANES + lane]) - (((word << 1) & 0xFFE) | ((word >> 11) & 1)) + vector_on
-                pack_run(offset + 2 * vector_x, offset + 2 * MAX_SIDE, mask, lists, n)
-                n += population(mask)
-                # A base outside every sensor need not grow: it would overflow in the end.
-                vector_x = min(vector_x + columns, 2 * MAX_SIDE)
-            at = max(at, place + size)
-            j += np.uint64(size)
+                n = _take_rest(words, position, state, triggers, n, n_places, lists, ledger)
         if timed:
-            copy_run(lists, of_x + copied, lists, n, n_x - copied)
-            copy_run(lists, of_x_lows + copied, lists, LOWS + n, n_x - copied)
+            copied = ledger[COPIED] if n_places > 0 else np.int64(0)
+            copy_x(lists, copied, n_x, n)
             n += n_x - copied
-        state[LOW], state[ROW] = low, row
-        state[VECTOR_X], state[VECTOR_ON] = vector_x, vector_on
-        state[RATE_BEFORE] += rate_before
-        state[RATE_AFTER] += rate_after
-        state[RATE_COUNTS] += rate_counts
+        state[OTHERS] += n_others
+        settled = ledger[SETTLED] if n_places > 0 else np.int64(0)
+        settle_last(words, position, settled, last_count, last_other, state)
+        if last_low >= 0:
+            state[LOW] = np.int64(words[position + last_low]) & 0xFFF
+        if last_row >= 0:
+            state[ROW] = words[position + last_row]
         return at, n, end < LANES
 
     return take_blocks

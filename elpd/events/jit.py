@@ -96,6 +96,7 @@ def _taken_in(function: Any) -> str:
                 digest.update(f"{name}={value!r}".encode())
             elif isinstance(value, _Intrinsic):
                 waiting.append(value._defn)  # noqa: SLF001
+                waiting += [value._defn.emit] if hasattr(value._defn, "emit") else []  # noqa: SLF001
             elif isinstance(getattr(value, "py_func", None), FunctionType):
                 waiting.append(value.py_func)
     return digest.hexdigest()

@@ -46,11 +46,13 @@ from elpd.vision.resting import LISTEN_MS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.focus.picture import Picture
     from elpd.focus.settings import CycleSettings, FocusRequest
     from elpd.focus.sweep import SweepReport
     from elpd.ports import RigParts, RunSink
     from elpd.records import ElpSample, TemporalImage
     from elpd.vision.reference import Reference
+    from elpd.vision.sharpest import Sharpest
 
 BIAS_SETTLE_MS = 10.0
 """After new biases or a new window a sensor needs a few ms before its events mean anything."""
@@ -116,15 +118,11 @@ class FocusCycle:
         self._warnings: list[str] = []
         self._scene = Scene(self._stage, request, settings, sink, self._phase)
 
-    @property
-    def reference(self) -> Reference | None:
-        """The weights that the region is judged by; ``None`` if it was never chosen."""
-        return None if self._watch is None else self._watch.reference
-
-    @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of the last direction of travel, to its end."""
-        return () if self._watch is None else self._watch.passage
+    def sharpest(self, depths: float) -> Sharpest | None:
+        """Return the picture in focus and what it loses over so many depths of focus; ``None`` if it was not seen."""
+        if self._watch is None or self._estimate is None:
+            return None
+        return self._watch.after.sharpest(self._estimate.focus_um, depths * self._settings.depth_of_focus_um)
 
     def run(self) -> FocusResult:
         """Run the cycle to its one result.
@@ -172,7 +170,7 @@ class FocusCycle:
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        watch = self._arm(reference, roi, frames=picture.map is None)
+        watch = self._arm(reference, roi, picture)
         if self._request.dry_run:
             raise Ended(Outcome.CANCELLED, "dry run: the reference has texture in the ROI; nothing was moved")
         try:
@@ -188,7 +186,7 @@ class FocusCycle:
         ended = come_to_rest(self._stage, watch, passed.stop, way, sign)
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
         first, furthest_um = watch.after.estimate(), ended.um
-        if recross.is_needed(watch):
+        if recross.is_needed(watch, first, self._settings):
             first, furthest_um = self._pass_again(watch, first, sign)
             way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
         estimate = self._judge(watch, first, sign, (passed.begun_um, furthest_um))
@@ -198,7 +196,7 @@ class FocusCycle:
         self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
 
-    def _arm(self, reference: Reference, roi: Roi, *, frames: bool) -> Watch:
+    def _arm(self, reference: Reference, roi: Roi, picture: Picture) -> Watch:
         """Switch the sensor to focusing, let it settle, and learn what noise alone looks like."""
         camera, geometry, settings = self._parts.camera, self._parts.camera.geometry, self._settings
         if isinstance(camera, Biases):
@@ -214,11 +212,15 @@ class FocusCycle:
             roi,
             geometry,
             WatchSettings(
-                settings.speed_um_s, settings.depth_of_focus_um, Play.up_to(settings.backlash_um), frames=frames
+                settings.speed_um_s,
+                settings.depth_of_focus_um,
+                Play.up_to(settings.backlash_um),
+                frames=picture.map is None,
             ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
             sensor,
+            picture.levels,
         )
         self._watch = watch
         self._stage.listener = watch.rest
@@ -243,16 +245,13 @@ class FocusCycle:
 
     def _search_from_aside(self) -> SweepReport:
         """Go off focus, where the lens began in it, and look for it as from anywhere else: with a picture of there."""
-        turned = self._reversals
         self._stage.listener, self._stage.interrupt = None, self._interrupt
+        self._warnings = []  # the sensor at rest is asked anew
         towards = stand_aside(self._stage, self._settings, int(self._details["sweep_sign"]))
         picture = self._scene.picture()
         self._phase(Phase.CHOOSE)
         roi, reference = self._scene.choose(picture, self._details)
-        try:
-            return self._search(self._arm(reference, roi, frames=picture.map is None), towards)
-        finally:
-            self._reversals += turned
+        return self._search(self._arm(reference, roi, picture), towards)
 
     def _search(self, watch: Watch, from_aside: int = 0) -> SweepReport:
         """Find focus; whatever comes of it, the result knows the direction, the strategy and the reversals."""
@@ -269,6 +268,7 @@ class FocusCycle:
             cancelled=self._cancelled,
             interrupt=self._interrupt,
             from_aside=from_aside,
+            reversals=self._reversals,
         )
         try:
             return search.run()

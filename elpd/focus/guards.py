@@ -74,7 +74,8 @@ def of_marks(marks: int | None) -> list[str]:
     if marks != 0:
         return []
     seen = "the lens marks its positions on a line to the camera's trigger input, and the camera saw no edge that fits"
-    return [f"{seen}: check that wire, and lens.sync_channel; positions are those of the clocks alone"]
+    told = "check that wire, lens.sync_channel, and that the camera's driver listens to its input"
+    return [f"{seen}: {told}; positions are those of the clocks alone"]
 
 
 def of_loss(lost_events: int) -> list[str]:

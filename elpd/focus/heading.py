@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from elpd.records import ElpSample
     from elpd.vision.detector import RestingRate
     from elpd.vision.memory import EventMemory
+    from elpd.vision.resting import Resting
 
 SIGMAS_OF_PROBE = 5.0
 """What turns the first direction round: a false one costs a turn, and every micrometre the wrong way counts."""
@@ -39,16 +40,18 @@ class Heading:
         self._bearing = bearing
 
     @classmethod
-    def of_sweep(cls, rest: RestingRate, memory: EventMemory, *, again: bool, scene_moves: bool) -> Heading:
-        """Return what judges a sweep whose image is built in *memory*."""
-        bearing = Bearing(ROI_MARGIN_PX, pictured=memory.pictured, again=again) if scene_moves else None
+    def of_sweep(cls, rest: RestingRate, resting: Resting, *, again: bool) -> Heading:
+        """Return what judges a sweep that begins after *resting*."""
+        bearing = None
+        if resting.unrest is not None:
+            bearing = Bearing(resting.unrest, ROI_MARGIN_PX, resting.beneath, again=again)
         return cls(rest, bearing, again=again)
 
     def feed(self, sample: ElpSample, memory: EventMemory, *, ticked: bool) -> None:
         """Take a window, and the image where it was time to look at it."""
         self._detector.feed(sample)
         if self._bearing is not None and ticked:
-            self._bearing.look(memory.image)
+            self._bearing.look(memory.image, sample.end_us)
 
     @property
     def seen_ahead(self) -> bool:

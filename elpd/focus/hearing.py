@@ -24,6 +24,8 @@ from elpd.vision.saturation import RateWatch
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from numpy.typing import NDArray
+
     from elpd.records import CameraPacket, ElpSample, Geometry, Roi, SensorProfile
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import BuiltImage
@@ -45,6 +47,8 @@ class Hearing:
         Lens position in um at a sensor time.
     sensor
         What a calibration knows of the sensor.
+    picture
+        Makes the first picture, as ``Resting`` wants it.
     """
 
     def __init__(
@@ -57,10 +61,11 @@ class Hearing:
         speed_um_s: float,
         locate: Callable[[SensorUs], float],
         sensor: SensorProfile | None,
+        picture: Callable[[], NDArray[np.float32]] | None,
     ) -> None:
         self.reference = reference
         """The weights that the region is judged by."""
-        self.resting = Resting(roi, geometry)
+        self.resting = Resting(roi, geometry, picture)
         """What the sensor says at rest."""
         self.rest_rate = RestingRate()
         """What noise alone looks like, known once ``armed``."""

@@ -182,10 +182,20 @@ class Passes:
         self.scene_moves |= said.scene_moves
         self.deaf = self.deaf or said.deaf
 
+    def forget(self) -> None:
+        """Forget what witnesses said of a scene that was taken for still; it moves."""
+        self._said = [(Testimony(), sign) for _, sign in self._said]
+        self.scene_moves = True
+
     @property
     def sign(self) -> int:
         """Direction of the sweep; 0 before it is over."""
         return self._said[0][1] if self._said else 0
+
+    @property
+    def both_ways(self) -> bool:
+        """Whether passes in both directions have found focus."""
+        return len({sign for said, sign in self._said if said.witnesses}) > 1
 
     def hold_any(self, times_us: Sequence[int]) -> bool:
         """Say whether any of the times was near focus."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from elpd.focus import stored_map
@@ -12,6 +13,7 @@ from elpd.records import TemporalImage
 from elpd.units import SensorUs
 from elpd.vision.pictures import read_picture
 from elpd.vision.reference import check_size, reference_from_frame, reference_from_temporal_image
+from elpd.vision.track import USUAL_THRESHOLD, frame_levels
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,6 +65,15 @@ class Picture:
         log_image = np.ascontiguousarray(image.pixels, np.float32)
         valid = np.ones(log_image.shape, np.bool_)
         return cls.of_map(TemporalImage(log_image, valid, SensorUs(0), 1.0, 0, 0, float("nan")))
+
+    def levels(self) -> NDArray[np.float32]:
+        """Return its log brightness in contrast thresholds, (height, width); what is not valid is as around it."""
+        if self.pixels is not None and self.map is None:
+            return frame_levels(self.pixels)
+        around = cv2.medianBlur(
+            np.where(self.valid, self.log_image, np.float32(np.median(self.log_image[self.valid]))), 5
+        )
+        return np.asarray(np.where(self.valid, self.log_image, around) / np.float32(USUAL_THRESHOLD), np.float32)
 
     def reference(self, roi: Roi) -> Reference:
         """Make the weights over a region."""

@@ -35,14 +35,20 @@ ROUNDS_LEFT = 2.0
 """How many more rounds there must be time for, so that one is begun: the way to focus takes less than one."""
 
 
-def is_needed(watch: Watch) -> bool:
+def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
     """Say whether one pass is not enough: the scene has been seen to move.
 
-    In a still scene a doubtful answer may come of several depths as well as of the lag; more passes would make their
-    mixture look certain, so such an answer is refused as it is. Where events were lost near focus, or a lamp flickers,
-    other passes would not help.
+    In a still scene a doubtful answer may come of several depths as well as of the lag; more passes would only make
+    their mixture look certain, so such an answer is refused as it is. Where motion was suspected at rest, the scene is
+    taken for one that moves after all, and what the first pass said of it as still is forgotten. Where events were
+    lost near focus, or a lamp flickers, other passes would not help.
     """
-    return watch.scene_moves and not watch.after.gap_near_crossing and not watch.lit
+    if watch.after.gap_near_crossing or watch.lit:
+        return False
+    doubtful = first is None or first.sigma_um > judging.limit_um(settings)
+    if not watch.scene_moves and doubtful and watch.motion_suspected and not watch.after.depths_um:
+        watch.after.take_for_moving()
+    return watch.scene_moves
 
 
 def pass_again(

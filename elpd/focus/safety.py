@@ -58,6 +58,8 @@ class Conditions:
     camera_silent_ms: float = 0.0
     travel_um: float = 0.0
     """Modelled travel since this sweep direction began."""
+    trodden_um: float = 0.0
+    """How much of it leads back over the way that was just come, on which events undo one another."""
     commanded_travel_um: float = 0.0
     """Travel that the commands alone ask for at the time of the newest report, turning and starting allowed for."""
     reported_travel_um: float | None = None
@@ -128,7 +130,7 @@ def _verdicts(now: Conditions) -> Iterator[Verdict]:
             "check that the motor is energised and free",
         )
     dark_um = DARK_TRAVEL_DOF * now.depth_of_focus_um
-    if now.travel_um > dark_um and not now.lit and is_dark(now) and now.camera_silent_ms < HEARD_MS:
+    if now.travel_um - now.trodden_um > dark_um and not now.lit and is_dark(now) and now.camera_silent_ms < HEARD_MS:
         yield Verdict(
             Action.GIVE_UP,
             Outcome.TOO_FEW_EVENTS,

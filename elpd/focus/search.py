@@ -54,6 +54,8 @@ class Search:
         Whether somebody wants an end, and what ends a wait.
     from_aside
         In which direction focus lies, where the lens has just gone off it on purpose; else 0.
+    reversals
+        How many there have been in this cycle.
 
     """
 
@@ -71,6 +73,7 @@ class Search:
         cancelled: Callable[[], int],
         interrupt: Callable[[], None],
         from_aside: int = 0,
+        reversals: int = 0,
     ) -> None:
         self._from_aside = from_aside
         self._stage = stage
@@ -84,7 +87,7 @@ class Search:
         self._observe = observe
         self._cancelled = cancelled
         self._interrupt = interrupt
-        self.reversals = 0
+        self.reversals = reversals
         self.sign = 0
         """Direction of the present or last sweep."""
         self.strategy = ""
@@ -108,6 +111,7 @@ class Search:
         sign = self._first_sign()
         reach_um = self._settings.max_travel_um
         turned_at_um: float | None = None
+        trodden_um = 0.0
         lit, dark = watch.lit, True
         while True:
             self._stage.listener = self._stage.interrupt = None  # a sweep asks for itself, and stops the lens first
@@ -122,6 +126,7 @@ class Search:
                 depth_of_focus_um=self._settings.depth_of_focus_um,
                 stop_mode=StopMode.ABRUPT if capabilities.abrupt_stop else StopMode.RAMPED,
                 turned_at_um=turned_at_um,
+                trodden_um=trodden_um,
                 lit=lit,
             )
             self._phase(Phase.SWEEP, sign=sign, position_um=self._stage.here_um())
@@ -144,7 +149,8 @@ class Search:
                     continue  # far from focus a lens may go a long way before anything changes
                 raise ended_by(report.verdict)
             dark = dark and report.end is SweepEnd.RULE and report.dark
-            if report.end is SweepEnd.BEHIND and turned_at_um is not None and not self._from_aside:
+            once_more = self.reversals < self._settings.max_reversals and not self._from_aside
+            if report.end is SweepEnd.BEHIND and turned_at_um is not None and once_more:
                 self.reversals += 1
                 raise Beside(Outcome.NO_CROSSING, "focus seemed to lie behind both ways")
             if self.reversals >= self._settings.max_reversals:
@@ -162,6 +168,7 @@ class Search:
                     "does the subject move in depth? raise focus.max_reversals or hold it still",
                 )
             turned_at_um = self._stage.here_um() if report.end is SweepEnd.BEHIND else None
+            trodden_um = abs(self._stage.here_um() - report.begun_um) if report.end is SweepEnd.BEHIND else 0.0
             if report.end is SweepEnd.RULE:
                 self._stage.listener = watch.follow
                 self._stage.rest(REST_LIMIT_MS)

@@ -7,12 +7,12 @@ any bookkeeping; what the loop learned is read from the sweep afterwards.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
 from elpd.focus import safety
-from elpd.records import Direction, StopMode
+from elpd.records import Direction, Outcome, StopMode
 from elpd.units import NS_PER_MS, HostNs, after_ms
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ class SweepPlan:
     stop_mode: StopMode
     turned_at_um: float | None = None
     """Where the reversal that led to this direction was commanded; ``None`` if there was none."""
+    trodden_um: float = 0.0
+    """How far it leads back over the way that was just come, on which events undo one another."""
     lit: bool = False
     """Whether it is known that the scene is in the light."""
 
@@ -112,6 +114,9 @@ class Sweep:
                     return SweepReport(SweepEnd.BEHIND, safety.Verdict(safety.Action.CONTINUE), None, begun_um)
             conditions = self._conditions(plan, begun_ns, begun_um, heard_ns, reported_from)
             verdict = safety.decide(conditions)
+            if verdict.outcome is Outcome.TOO_FEW_EVENTS and watch.sees_a_scene:
+                plan = replace(plan, lit=True)  # what it sent at rest was more than noise: the scene moved
+                continue
             if verdict.action is not safety.Action.CONTINUE:
                 stop = lens.stop(StopMode.ABRUPT if verdict.action is safety.Action.FAULT else plan.stop_mode)
                 return SweepReport(SweepEnd.RULE, verdict, stop, begun_um, dark=safety.is_dark(conditions))
@@ -134,6 +139,7 @@ class Sweep:
             ms_to_deadline=(plan.deadline_ns - now) / NS_PER_MS,
             camera_silent_ms=(now - heard_ns) / NS_PER_MS,
             travel_um=plan.sign * (here_um - begun_um),
+            trodden_um=plan.trodden_um,
             commanded_travel_um=commanded_um,
             reported_travel_um=reported_um,
             max_travel_um=plan.max_travel_um,

@@ -16,9 +16,13 @@ from elpd.focus.heading import Heading
 from elpd.focus.hearing import Hearing
 from elpd.focus.shedding import Shedding
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS
+from elpd.vision.resting import SIGMAS_OF_MOTION, order
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from elpd.records import CameraPacket, Direction, ElpSample, Frame, Geometry, Roi, SensorProfile
     from elpd.units import SensorUs
@@ -53,6 +57,8 @@ class Watch:
         Makes weights of a newer frame, for cameras that have frames.
     sensor
         What a calibration knows of the sensor.
+    picture
+        Makes the first picture: log brightness in contrast thresholds, (height, width) of the sensor.
     """
 
     def __init__(
@@ -64,6 +70,7 @@ class Watch:
         locate: Callable[[SensorUs], float],
         rereference: Rereference | None = None,
         sensor: SensorProfile | None = None,
+        picture: Callable[[], NDArray[np.float32]] | None = None,
     ) -> None:
         self.roi = roi
         self._settings = settings
@@ -77,6 +84,7 @@ class Watch:
             speed_um_s=settings.speed_um_s,
             locate=locate,
             sensor=sensor,
+            picture=picture,
         )
         self.shedding = Shedding(roi, geometry)
         """What of a sweep is not looked at when there is too much of it."""
@@ -126,6 +134,11 @@ class Watch:
         return self.resting.moves if self._after is None else self._after.scene_moves
 
     @property
+    def motion_suspected(self) -> bool:
+        """Whether the resting sensor said more than noise does, too little for certainty."""
+        return self.resting.unrest is not None
+
+    @property
     def resting_rate_hz(self) -> float:
         """Events per second that noise makes in the region: what it sends at rest, unless the scene moved."""
         return 0.0 if self.scene_moves else 1e6 * self._hearing.rest_rate.events_per_us
@@ -159,9 +172,7 @@ class Watch:
             settings.depth_of_focus_um,
             lit=self.lit,
         )
-        heading = Heading.of_sweep(
-            hearing.rest_rate, hearing.memory, again=turned_at_um is not None, scene_moves=self.scene_moves
-        )
+        heading = Heading.of_sweep(hearing.rest_rate, hearing.resting, again=turned_at_um is not None)
         self._course = Course(leg, hearing.memory, FrameTrack(self.roi, follow=self.scene_moves), heading)
         self._after = Aftermath(hearing, self._course, settings, self._locate)
         self.events = 0
@@ -184,6 +195,11 @@ class Watch:
             if self._rereference is not None:
                 self._hearing.rereference(self._rereference(frame))
         return samples
+
+    @property
+    def sees_a_scene(self) -> bool:
+        """Whether the events of this direction lie together by their sign, as noise alone never does."""
+        return order(self._hearing.memory.change()) > SIGMAS_OF_MOTION
 
     @property
     def passed(self) -> bool:
@@ -220,11 +236,6 @@ class Watch:
         """What is made of the sweep, once focus has been passed."""
         assert self._after is not None, "begin() comes first"
         return self._after
-
-    @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of the last pass in the sweep's direction so far."""
-        return () if self._after is None else self._after.passage
 
     @property
     def depths_um(self) -> tuple[float, ...]:

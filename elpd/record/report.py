@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from contextlib import suppress
 from html import escape
 from importlib.resources import files
@@ -82,11 +83,11 @@ def _head(run: RecordedRun, path: Path) -> str:
     if result.get("focus_um") is not None:
         sigma = "" if result.get("sigma_um") is None else f" <small>± {result['sigma_um']:.2f}</small>"
         found = f'<p class="found">{result["focus_um"]:.2f} <small>µm</small>{sigma}</p>'
-    remarks = "".join(f"<li>{escape(str(text))}</li>" for text in result.get("warnings", []))
+    remarks = "".join(f"<li>{escape(_prose(str(text)))}</li>" for text in result.get("warnings", []))
     cut = f'<p class="remark">The record is not complete: {escape(str(run.truncated))}</p>' if run.truncated else ""
     return (
         f'<header><p class="name">{escape(path.resolve().name)} · elpd {escape(str(run.elpd))}</p>'
-        f'<h1 class="{good}">{escape(_outcome(run))}</h1>{found}<p>{escape(str(reason))}</p>'
+        f'<h1 class="{good}">{escape(_outcome(run))}</h1>{found}<p>{escape(_prose(str(reason)))}</p>'
         f"{f'<ul>{remarks}</ul>' if remarks else ''}{cut}</header>"
     )
 
@@ -95,10 +96,12 @@ def _plots(notes: list[Note], result: Note | None) -> str:
     windows = [note for note in notes if note["event"] == "window" and _is_number(note["position_um"])]
     if len(windows) < 2:
         return "<section><h2>Sweep</h2><p>The lens never swept, so there is no curve.</p></section>"
+    before = sum(len(_moving(way)) > 1 for way in split_ways(notes)) > 1
+    earlier = '<span><b class="earlier"></b> before a reversal: negative, focus lies behind</span>' if before else ""
     return (
         f"<section><h2>Event Laplacian Product over the lens position</h2>{_curve(notes, windows, result or {})}"
-        '<p class="legend"><b class="last"></b> the last sweep <b class="earlier"></b> before a reversal: negative, '
-        "focus lies behind. Dots are single windows, lines the mean of five.</p></section>"
+        f'<p class="legend"><span><b class="last"></b> the last sweep</span>{earlier}'
+        "<span>dots are single windows, lines the mean of five</span></p></section>"
         f"<section><h2>The lens over time</h2>{_path(windows)}<h2>Events per window</h2>{_rate(windows)}</section>"
     )
 
@@ -214,7 +217,7 @@ def _details(run: RecordedRun) -> str:
         ("Reversals", str(result.get("reversals"))),
         ("Events in the region", f"{result.get('events', 0):,}"),
         ("Events known to be lost", f"{result.get('lost', 0):,}"),
-        ("Strategy", str((result.get("details") or {}).get("strategy", "–"))),
+        ("Strategy", str((result.get("details") or {}).get("strategy", "–")).replace("_", " ")),
         *((f"Plane in focus at ({nth})", _um(um)) for nth, um in enumerate(result.get("depths_um") or [], 1)),
         *(
             (f"Simulator: {name.removesuffix('_um').replace('_', ' ')}", _um(um))
@@ -291,6 +294,11 @@ def _outcome(run: RecordedRun) -> str:
     if run.result is not None:
         return str(run.result.get("outcome", "no outcome")).replace("_", " ").capitalize()
     return "Error" if run.error is not None else "Cut off"
+
+
+def _prose(text: str) -> str:
+    """Write a cycle's sentence as people read it: it has um where µm is meant."""
+    return re.sub(r"(?<=\d )um\b", "µm", text)
 
 
 def _is_number(value: Any) -> bool:

@@ -74,7 +74,7 @@ class SvgPlot:
         bottom = self._size[1] - BOTTOM
         self._parts.append(f'<line class="{name}" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{bottom}"/>')
         if label:
-            anchor = "end" if at > 0.8 * self._size[0] else "start" if at < 0.2 * self._size[0] else "middle"
+            anchor = "end" if at > 0.8 * self._size[0] else "start" if low or at < 0.2 * self._size[0] else "middle"
             x, y = (at - 6 if anchor == "end" else at + 6, bottom - 8) if low else (at, 14)
             words = escape(label)
             self._above.append(f'<text class="{name}" x="{x:.1f}" y="{y:g}" text-anchor="{anchor}">{words}</text>')

@@ -13,12 +13,14 @@ import structlog
 
 from elpd import rig
 from elpd.calibrate.profile import state_directory
-from elpd.errors import FaultLatchedError, UnavailableError, UnreferencedError, UsageError
+from elpd.errors import UnavailableError
 from elpd.records import Cancel, StopMode
 from elpd.service import archive, memory
+from elpd.service.admission import refuse_motion
 from elpd.service.attention import Attention
 from elpd.service.autopilot import Autopilot
 from elpd.service.backroom import Backroom, answer_of
+from elpd.service.books import Books
 from elpd.service.clerk import Clerk
 from elpd.service.heartbeats import Heartbeats
 from elpd.service.idle import Idle
@@ -60,9 +62,6 @@ DEVICE_METHODS = frozenset({"focus", "home", "move", "jog", "record"})
 RIG_SECTIONS = ("rig", "camera", "lens", "aperture", "sim", "state")
 """What a rig is made of: another one of these is another rig."""
 
-WITHOUT_REFERENCE = frozenset({"home", "record"})
-"""What a lens that does not know where it is may be asked for."""
-
 log = structlog.get_logger(__name__)
 
 
@@ -97,6 +96,7 @@ class RigEngine:
         self.keeper = RigKeeper(config, build)
         self.situation = Situation(config, time.now_s)
         self.lease = Lease(time.now_s)
+        self._threaded = threaded
         self.backroom = Backroom(threaded=threaded)
         self.album = Album(time.now_s)
         self._kept = Kept(state_directory(config))
@@ -109,9 +109,19 @@ class RigEngine:
         self._work = work
         self.idle = Idle(self.situation, time, config.service, self._hear)
         self.worker = Worker(
-            self.keeper, self.place, self.idle, work, self.autopilot, self.situation, attention, time, self._ended
+            self.keeper,
+            self.place,
+            self.idle,
+            work,
+            self.autopilot,
+            self.situation,
+            attention,
+            time,
+            self._ended,
+            lambda: self.album.watched,
         )
-        self._remember()
+        self._books = Books(self._kept, self.situation)
+        self.keeper.needs_home = self._books.remember()
 
     # --- what the socket sees ----------------------------------------------------------------------------------------
 
@@ -191,7 +201,7 @@ class RigEngine:
     def ready(self) -> None:
         """Everything that could be opened is; requests are taken from now on."""
         self._kept.change(open=True)
-        self._save()
+        self._books.save()
         self.situation.began()
 
     def reload(self, config: Config, done: Callable[[], None] = lambda: None) -> None:
@@ -228,7 +238,7 @@ class RigEngine:
         """Give everything back. Called by whoever steps, after the last step."""
         self.worker.release()
         self._kept.change(open=False)
-        self._save()
+        self._books.save()
         self.backroom.close()
 
     # --- below -------------------------------------------------------------------------------------------------------
@@ -245,7 +255,7 @@ class RigEngine:
         if operates(method, params):
             self.lease.refuse_others(request.caller)
         if method in DEVICE_METHODS or (method == "preset" and getattr(params, "action", None) == "apply"):
-            self._refuse_motion(job)
+            refuse_motion(request, self.situation, self.autopilot.mode, needs_home=self.keeper.needs_home)
             self.place.put(job)
             return
         directory = self.config.journal.directory
@@ -260,24 +270,8 @@ class RigEngine:
             self.backroom.answer(job, table[method])
             return
         result = self._clerk.answer(request)
-        self.backroom.also(self._save)
+        self.backroom.also(self._books.save)
         job.finish(answer_of(lambda: result))
-
-    def _refuse_motion(self, job: Job) -> None:
-        method, params = job.request.method, job.request.params
-        state, fault = self.situation.state, self.situation.fault
-        if state == "STARTING":
-            raise UnavailableError("the daemon is starting; nothing was moved, ask again in a moment")
-        if fault is not None:
-            raise FaultLatchedError(
-                f"nothing was moved: a fault is latched ({fault.kind}: {fault.message}); see to it, then clear it"
-            )
-        if method == "record" or (isinstance(params, FocusParams) and params.dry_run):
-            return
-        if method == "focus" and self.autopilot.mode == "manual":
-            raise UsageError("the mode is manual: autofocus never moves the lens; set another mode first")
-        if method not in WITHOUT_REFERENCE and self.keeper.needs_home:
-            raise UnreferencedError("the lens may have moved unseen and does not know where it is; home it first")
 
     def _ended(self, job: Job, answer: Answer) -> None:
         """Keep the books of a request that was done, before anybody hears of it."""
@@ -289,9 +283,10 @@ class RigEngine:
             budget_bytes = 1e6 * self.config.journal.budget_mb
             directory = self.config.journal.directory
             self.backroom.also(lambda: archive.keep_budget(directory, budget_bytes))
-            self.backroom.also(memory.trim)
+            if self._threaded:
+                self.backroom.also(memory.give_back)
         self.autopilot.ended(job, answer, self._work.session)
-        self.backroom.also(self._save)
+        self.backroom.also(self._books.save)
 
     def _hear(self, packet: CameraPacket, events: EventArrays) -> None:
         """Take what the idle camera says."""
@@ -302,24 +297,3 @@ class RigEngine:
         if parts is not None:
             self.album.keep_events(events, parts.camera.geometry, position_um)
             self.autopilot.hear(events)
-
-    def _remember(self) -> None:
-        """Begin with what was kept."""
-        kept = self._kept.content
-        self.situation.set_roi(kept.roi)
-        self.keeper.needs_home = kept.open
-        if self._kept.complaint is not None:
-            self.situation.warn("state-damaged", self._kept.complaint)
-            log.warning("state damaged", reason=self._kept.complaint)
-        if kept.open:
-            log.warning("daemon ended badly before")
-
-    def _save(self) -> None:
-        try:
-            self._kept.save()
-        except OSError as error:
-            text = f"{self._kept.path}: {error.strerror or error}; what was set is lost when the daemon ends"
-            self.situation.warn("state-not-saved", text)
-            log.warning("state not saved", reason=text)
-        else:
-            self.situation.unwarn("state-not-saved")

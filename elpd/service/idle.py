@@ -2,7 +2,8 @@
 
 A lens at rest is asked where it is all the same, for a cable that was pulled should be known of before somebody asks
 for focus, and some boards switch their motor off when nobody asks. The camera is listened to all the time, or for a
-moment now and then where listening costs (``service.look_every_s``).
+moment now and then where listening costs (``service.look_every_s``). What it says is decoded where that is of use:
+while continuous mode weighs it or somebody looks at its pictures; else a tenth of it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import CameraError, LensError
 from elpd.events.stream import PacketDecoder
-from elpd.records import LensFlag
+from elpd.records import Geometry, LensFlag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,12 +24,19 @@ if TYPE_CHECKING:
     from elpd.service.situation import Situation
     from elpd.service.timing import Time
 
-READ_TIMEOUT_S = 0.01
-"""One turn of listening; a request waits no longer than this for its turn."""
+LISTEN_TURN_S = 0.02
+"""One turn of listening: packets gather meanwhile, since waking for each costs more than what it holds. No camera's
+buffers fill in that time, and a request ends the wait."""
+
+MOST_PACKETS_A_TURN = 256
+"""More than a camera sends in a turn; one that floods must not keep a request waiting."""
 
 POLL_TURN_S = 0.002
 FIRST_REPORT_S = 1.0
 """A controller that has just been identified tells where it is within this time."""
+
+GLANCE_EVERY_S = 1.0
+"""Where nobody watches, one look in so much time is attentive; the others are for silence and losses."""
 
 SILENCE_S = 1.0
 """While nothing moves a camera may say nothing for so long before it counts as lost."""
@@ -61,6 +69,7 @@ class Idle:
         self._time = time
         self._settings = settings
         self._hear = hear
+        self._geometry = Geometry(1, 1)
         self._decoder: PacketDecoder | None = None
         self._look_begun_s: float | None = None
         self._look_ended_s = float("-inf")
@@ -68,8 +77,12 @@ class Idle:
         self._events = 0
         self._listened_s = 0.0
         self._polled_s = float("-inf")
+        self._attentive = True
+        self._attended_s = float("-inf")
         self.every_s = 0.0
         """How often to listen; 0 is all the time."""
+        self.somebody_watches = True
+        """Whether all that is heard matters; else it is mostly only looked whether something comes."""
 
     def reconfigure(self, settings: ServiceSection) -> None:
         """Take other settings."""
@@ -83,7 +96,8 @@ class Idle:
     def opened(self, parts: RigParts) -> None:
         """Begin with a rig that was just opened."""
         geometry = parts.camera.geometry
-        self._decoder = PacketDecoder(geometry)
+        self._geometry, self._decoder = geometry, PacketDecoder(geometry)
+        self._attended_s = float("-inf")
         self._look_begun_s, self._look_ended_s, self._polled_s = None, float("-inf"), float("-inf")
         limits = parts.lens.limits
         self._situation.update_camera(width=geometry.width, height=geometry.height, connected=True)
@@ -115,7 +129,7 @@ class Idle:
             left_s = self._look_ended_s + self.every_s - now_s
             self._time.nap(max(1e-4, min(1e-3 * self._settings.poll_ms, left_s)))
             return
-        self._read(parts)
+        self._listen(parts)
         if self._time.now_s() - self._look_begun_s >= self._settings.look_s:
             self._end_look(parts)
 
@@ -141,38 +155,56 @@ class Idle:
 
     def _begin_look(self, parts: RigParts, now_s: float) -> None:
         parts.camera.start()
-        self._decoder = PacketDecoder(parts.camera.geometry)
-        self._look_begun_s = self._last_packet_s = now_s
-        self._events = 0
+        self._decoder = PacketDecoder(self._geometry)
+        self._last_packet_s = now_s
+        self._attend(now_s)
+
+    def _attend(self, now_s: float) -> None:
+        """Begin a look; where nobody watches, one in a while is enough to tell what the camera sees."""
+        self._look_begun_s, self._events = now_s, 0
+        attentive = self.somebody_watches or now_s - self._attended_s >= GLANCE_EVERY_S
+        if attentive and not self._attentive:
+            self._decoder = PacketDecoder(self._geometry)  # what it knew of time and place is old
+        self._attentive = attentive
+        if attentive:
+            self._attended_s = now_s
 
     def _end_look(self, parts: RigParts) -> None:
         now_s, begun_s = self._time.now_s(), self._look_begun_s
         assert begun_s is not None, "a look ends after it began"
-        self._listened_s += now_s - begun_s
-        rate = self._events / max(1e-6, now_s - begun_s)
-        known = {} if self._situation.camera.has_frames or self._listened_s < FRAMES_WITHIN_S else {"has_frames": False}
-        self._situation.update_camera(events_per_s=rate, **known)
+        if self._attentive:
+            self._listened_s += now_s - begun_s
+            rate = self._events / max(1e-6, now_s - begun_s)
+            none = not self._situation.camera.has_frames and self._listened_s >= FRAMES_WITHIN_S
+            self._situation.update_camera(events_per_s=rate, **({"has_frames": False} if none else {}))
         if self.every_s > 0:
             self.leave(parts)
         else:
-            self._look_begun_s, self._events = now_s, 0
+            self._attend(now_s)
 
-    def _read(self, parts: RigParts) -> None:
-        packet = parts.camera.read(READ_TIMEOUT_S)
-        now_s = self._time.now_s()
-        if packet is None:
-            silent_s = now_s - self._last_packet_s
-            if silent_s > SILENCE_S:
-                raise CameraError(
-                    f"camera: no data for {silent_s:.1f} s (limit {SILENCE_S:g}) while nothing moved; check its cable "
-                    "and power, then clear the fault"
-                )
-            return
-        self._last_packet_s = now_s
-        assert self._decoder is not None, "a look begins with a decoder"
-        events = self._decoder.feed(packet)
-        self._events += events.t.size
-        self._situation.heard(int(events.t.size), packet.lost_events)
-        frames = {"has_frames": True} if packet.frames else {}
-        self._situation.update_camera(backlog=packet.backlog, **frames)
-        self._hear(packet, events)
+    def _listen(self, parts: RigParts) -> None:
+        """Take what has come in a turn."""
+        self._time.nap(LISTEN_TURN_S)
+        events, lost, backlog, frames = 0, 0, 0, False
+        for _ in range(MOST_PACKETS_A_TURN):
+            packet = parts.camera.read(0.0)
+            if packet is None:
+                break
+            self._last_packet_s = self._time.now_s()
+            if not self._attentive:
+                lost += packet.lost_events
+                continue
+            assert self._decoder is not None, "a look begins with a decoder"
+            heard = self._decoder.feed(packet)
+            events, lost = events + int(heard.t.size), lost + packet.lost_events
+            backlog, frames = packet.backlog, frames or bool(packet.frames)
+            self._hear(packet, heard)
+        silent_s = self._time.now_s() - self._last_packet_s
+        if silent_s > SILENCE_S:
+            raise CameraError(
+                f"camera: no data for {silent_s:.1f} s (limit {SILENCE_S:g}) while nothing moved; check its cable "
+                "and power, then clear the fault"
+            )
+        self._events += events
+        if self._attentive or lost:
+            self._situation.heard(events, lost, backlog=backlog, **({"has_frames": True} if frames else {}))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from elpd.client.wire import LONGEST_PATH, SYSTEM_SOCKET
+from elpd.client.wire import LONGEST_PATH, SYSTEM_SOCKET, may_make
 from elpd.errors import BusyError, ConfigError
 
 if TYPE_CHECKING:
@@ -105,11 +105,11 @@ def listen_at(path: Path) -> Listening:
 
 def default_path() -> Path:
     """Return where a daemon listens that was not told: the system's place if it may, else its user's."""
-    place = SYSTEM_SOCKET.parent
-    if os.access(place if place.exists() else place.parent, os.W_OK | os.X_OK):
+    if may_make(SYSTEM_SOCKET):
         return SYSTEM_SOCKET
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if not runtime:
+        place = SYSTEM_SOCKET.parent
         raise ConfigError(f"api.socket: {place} may not be written and XDG_RUNTIME_DIR is not set; name a socket")
     return Path(runtime, "elpd", "elpd.sock")
 

@@ -1,8 +1,9 @@
 """Give back memory that is not needed: what a cycle leaves free in the allocator, and the compiler once kernels exist.
 
-A cycle fills and frees some tens of megabytes in pieces of every size. The C library keeps what was freed, and because
-the pieces that live lie between those that do not, what it keeps grows for hours although nothing leaks. So it is asked
-to give the free pages back after each cycle, at rest.
+A cycle fills some tens of megabytes in pieces of every size. What of it is garbage is found late, and what was freed
+the C library keeps; because the pieces that live lie between those that do not, that grows for hours although nothing
+leaks. So after each cycle, at rest, garbage is looked for and free pages are given back: a few milliseconds, since what
+existed at the start is left out of it (``gc.freeze``).
 
 LLVM's code is only run while kernels are compiled or loaded. Its pages are the file's own, so they can be dropped and
 would be read again if they were needed. On a focus thread that locks its memory they would stay locked for nothing.
@@ -11,6 +12,7 @@ would be read again if they were needed. On a focus thread that locks its memory
 from __future__ import annotations
 
 import ctypes
+import gc
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -26,6 +28,12 @@ class Stretch(NamedTuple):
 
     begin: int
     size: int
+
+
+def give_back() -> None:
+    """Let go of what a cycle has left: its parts know each other, so that only the garbage collector finds them."""
+    gc.collect()
+    trim()
 
 
 def trim() -> None:

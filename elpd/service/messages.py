@@ -11,20 +11,15 @@ from typing import Final
 
 from elpd.service.answered import (
     PROTOCOL,
-    ApertureStatus,
-    CameraStatus,
     CancelAnswer,
     ClearAnswer,
-    Counters,
     ErrorBody,
     Fault,
     FocusAnswer,
     HelloAnswer,
     Holder,
     HomeAnswer,
-    Latency,
     LeaseAnswer,
-    LensStatus,
     MapAnswer,
     MetricsAnswer,
     ModeAnswer,
@@ -39,11 +34,9 @@ from elpd.service.answered import (
     RunsAnswer,
     RunSummary,
     StateName,
-    Status,
     StopAnswer,
     SubscribeAnswer,
     TemperatureAnswer,
-    Warned,
 )
 from elpd.service.asked import (
     EventName,
@@ -64,6 +57,15 @@ from elpd.service.asked import (
     RunsParams,
     SubscribeParams,
     TemperatureParams,
+)
+from elpd.service.status import (
+    ApertureStatus,
+    CameraStatus,
+    Counters,
+    Latency,
+    LensStatus,
+    Status,
+    Warned,
 )
 from elpd.service.told import (
     DroppedEvent,

@@ -5,6 +5,9 @@ Hunting is the disease of continuous autofocus, so a cycle needs four things at 
 of a hold-off since the last cycle, and a lens that nobody else has put where it is. The hold-off doubles with every
 cycle that did not find focus or found it where it was; after ``MOST_FAILURES`` without focus the lens rests until
 somebody asks.
+
+A scene in which nothing changes sends no events, and what crept away unheard leaves no evidence; for that, and only if
+it is set, focus is checked again when it was not for so long.
 """
 
 from __future__ import annotations
@@ -54,6 +57,8 @@ class Patience:
     hold_off_s: float
     settle_s: float
     period_s: float
+    recheck_s: float = 0.0
+    """0: never without evidence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +92,11 @@ def decide(view: View, patience: Patience) -> Decision:
         return wait("the end of the hold-off", left_s)
     if not view.focused_once:
         return Decision(True, defocused, "nothing")
-    if not defocused:
-        return wait("a loss of sharpness")
-    if view.quiet_s < patience.settle_s:
+    recheck = patience.recheck_s > 0
+    recheck_left_s = view.since_s + patience.recheck_s - view.now_s
+    if not defocused and not (recheck and recheck_left_s <= 0):
+        return wait("a loss of sharpness", recheck_left_s if recheck else None)
+    if view.loss is not None and view.quiet_s < patience.settle_s:
         return wait("the scene to become quiet", patience.settle_s - view.quiet_s)
     return Decision(True, defocused, "nothing")
 

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from elpd.records import Frame, Geometry
     from elpd.service.messages import MapParams
 
+WATCHED_S = 3.0
+"""Whoever watches asks for a picture more often than this."""
+
 EVENTS_S = 0.05
 """A picture of events shows the last so many seconds of listening,"""
 
@@ -63,6 +66,12 @@ class Album:
         self._pieces: deque[tuple[float, NDArray[np.int32], NDArray[np.uint8]]] = deque()
         self._held = 0
         self._events_um: float | None = None
+        self._asked_s = float("-inf")
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody has asked for a picture lately."""
+        return self._now_s() - self._asked_s < WATCHED_S
 
     def keep_map(self, session: Session | None, position_um: float | None) -> None:
         """Keep a cycle's temporal map, if it made one."""
@@ -91,6 +100,7 @@ class Album:
 
     def picture(self, params: MapParams) -> MapAnswer:
         """Return a picture as it was asked for. Raises ``UsageError`` if there is none of that kind."""
+        self._asked_s = self._now_s()
         kind, shown = self._choose(params.kind)
         grey = _grey(shown, sixteen=params.format == "png16")
         height, width = grey.shape

@@ -209,11 +209,12 @@ class Situation:
         with self._lock:
             self._camera = self._camera.model_copy(update=known)
 
-    def heard(self, events: int, lost: int) -> None:
-        """Count events and losses."""
+    def heard(self, events: int, lost: int, **known: Any) -> None:
+        """Count events and losses, and take what else is known of the camera."""
         with self._lock:
             camera = self._camera
-            self._camera = camera.model_copy(update={"events": camera.events + events, "lost": camera.lost + lost})
+            counts = {"events": camera.events + events, "lost": camera.lost + lost}
+            self._camera = camera.model_copy(update={**counts, **known})
 
     def ended(self, last: FocusAnswer) -> None:
         """Count and tell the end of a cycle."""

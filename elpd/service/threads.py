@@ -165,7 +165,7 @@ class Supervisor:
         starved_s = self._overload.starved_s(silent_s)
         why = (
             f"the machine is overloaded: the focus thread was silent for {silent_s:.1f} s (limit {FOCUS_LIMIT_S:g}), "
-            f"of which this process stood in line for a processor for {starved_s:.1f} s; end what else runs, or give the "
+            f"of which this process stood in line for {starved_s:.1f} s; end what else runs, or give the "
             "daemon real-time priority"
         )
         if self._engine.keeper.in_real_time and self._engine.place.busy:

@@ -54,6 +54,8 @@ class Worker:
         What is told, what interrupts, and by which time.
     ended
         Hears of every request that was done, before its answer is given.
+    watched
+        Says whether somebody looks at the camera's pictures.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class Worker:
         attention: Attention,
         time: Time,
         ended: Callable[[Job, Answer], None],
+        watched: Callable[[], bool] = lambda: False,
     ) -> None:
         self._keeper = keeper
         self._place = place
@@ -77,6 +80,7 @@ class Worker:
         self._attention = attention
         self._time = time
         self._ended = ended
+        self._watched = watched
         self._begun = False
         self.reload: Callable[[], None] | None = None
         """What to do once nothing is being done; it closes or changes the rig's configuration."""
@@ -98,6 +102,7 @@ class Worker:
             self._run(job, parts)
             return
         self._idle.every_s = self._autopilot.listen_every_s
+        self._idle.somebody_watches = self._autopilot.mode == "continuous" or self._watched()
         try:
             self._idle.turn(parts, needs_home=self._keeper.needs_home)
         except DeviceError as error:
@@ -216,6 +221,7 @@ class Worker:
         self._situation.update_lens(moving=False)
         if job.request.method == "home":
             self._keeper.needs_home = False
+            self._situation.unwarn("ended-badly")
             self._situation.update_lens(referenced=True)
         try:
             self._idle.tell_lens(parts, parts.lens.poll(), needs_home=self._keeper.needs_home)

@@ -1,50 +1,125 @@
-"""Which way is focus while the scene moves: the sharpness of the events' own image, away from where it began.
+"""Which way is focus while the scene moves: the sharpness of what the sensor sees now, against what motion does to it.
 
-A product with a picture that has gone stale turns negative before focus; sharpness does not mind where the picture
-lies. Its change tells the direction within a few depths of focus, in a band of some pixels, where what pixels hold back
-(evenly up to a threshold) is next to nothing and a picture that is far out of focus still has structure.
+A product with a picture that has gone stale turns negative before focus; the sharpness of a *current* image does not
+mind where the picture lies. The image is a picture of the scene with the events since put upon it. Its energy in a band
+of some pixels rises toward focus and falls away from it, within a depth of focus or two.
 
-With a start picture the image is what the sensor sees now, and its energy rises toward focus and falls away from it.
-Without one the image is the *difference* from the start, whose energy grows as the scene moves off, whichever way the
-lens goes. It grows in a fine and in a coarse band alike, so there their ratio is judged, and the fine band's fall.
+How far to trust a change is not a constant but measured. *Events* are counted: each moves log S by the gradient of S at
+its pixel, and independent ones add up to a variance. *Motion* moves log S too, because thresholds are guessed, pixels
+hold back and the picture is some tenths of a pixel aside; and while the lens rests it moves it by nothing but that. So
+the rest before the sweep tells how much a pixel of the scene's travel, and a millisecond, are worth (``Unrest``), and
+the scene's travel goes on being measured during the sweep, from the events on the gradient of their own image. A change
+between any two looks that is three times what motion may have made of it, and five standard deviations of the events,
+is a direction.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from elpd.records import Direction
-from elpd.vision.integral import band_energy
+from elpd.vision.integral import band_image, inside_margin
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-RISE = 0.12
-FALL = 0.08
-"""Change of log energy that makes a direction: two depths of focus at ten times the blur. A picture's brightness floor
-and a threshold that is not known by a quarter make a rise of the same size look real sooner than a fall."""
+SHRINK = 4
+"""The image is looked at on a grid this many times coarser: where the direction is asked for, fine structure is gone,
+and a look costs a sixteenth."""
 
-TILT_RISE = 0.08
-TILT_FALL = 0.45
-"""The same of the ratio of the two bands, whose fall has a part that has nothing to do with focus: what moves decays
-from fine to coarse."""
+BAND_PX = 3.4
+"""The band, in pixels of the sensor: most of what is left of a picture ten depths of focus from focus lies there, and
+near focus it still changes by more than events scatter."""
+
+TIMES_MOTION = 3.0
+"""A change is this many times what motion alone may do: as rare as three standard deviations, of a scatter that itself
+is known from some ten milliseconds."""
+
+SIGMAS_OF_EVENTS = 5.0
+"""And this many standard deviations of what independent events would do."""
 
 AFTER_REVERSAL = 1.5
-"""A second turn costs the most: it needs this many times the fall of the first."""
+"""A second turn costs the most: it needs this many times as much of both."""
 
-SIGMAS = 6.0
-"""A change is also this many times the curve's own scatter."""
+LEAST_SHIFT_PX = 0.05
+"""Shifts smaller than this are the estimate's own noise."""
 
-UNSETTLED = 4
-"""Ticks at the beginning that say more of the start of the motor than of focus, where there is no picture."""
+_TINY = 1e-12
 
-FINE_PX = 0.7
-MIDDLE_PX = 1.2
-COARSE_PX = 2.4
-"""Bands, in pixels of the image at half its scale."""
+
+class Look(NamedTuple):
+    """What a look has found: log S, how far the scene has gone since the first, and the events' variance since then."""
+
+    t_ms: float
+    log_energy: float
+    x_px: float
+    y_px: float
+    variance: float
+
+
+class Gauge:
+    """Measures an image from look to look.
+
+    Parameters
+    ----------
+    margin:
+        Pixels at each side that are left out.
+    """
+
+    def __init__(self, margin: int) -> None:
+        self._margin = margin // SHRINK
+        self._image: NDArray[np.float32] | None = None
+        self._band = np.empty((0, 0), np.float32)
+        self._shift_px = np.zeros(2)
+        self._variance = 0.0
+
+    def look(self, image: NDArray[np.float32], t_us: int) -> Look:
+        """Measure an image, (height, width) in thresholds."""
+        band = band_image(_shrunk(image), BAND_PX / SHRINK)
+        inside = inside_margin(band.shape, self._margin)
+        kept = np.zeros_like(band)
+        kept[inside] = band[inside]
+        size = band[inside].size
+        energy = float(np.square(kept).sum(dtype=np.float64)) / size + _TINY
+        if self._image is not None:
+            # d log S by each pixel of the coarse grid, whose value is the mean of SHRINK² pixels with an event each.
+            gradient = band_image(kept, BAND_PX / SHRINK) * (2.0 / (size * energy))
+            fired = _shrunk(np.abs(image - self._image))
+            self._variance += float((np.square(gradient) * fired).sum(dtype=np.float64)) / SHRINK**2
+            self._shift_px += SHRINK * shift_between(self._band[inside], band[inside])
+        self._image, self._band = image.copy(), band
+        x_px, y_px = (float(one) for one in self._shift_px)
+        return Look(1e-3 * t_us, float(np.log(energy)), x_px, y_px, self._variance)
+
+
+@dataclass(frozen=True, slots=True)
+class Unrest:
+    """What motion alone does to log S: for each pixel that the scene goes, and for the root of each millisecond."""
+
+    per_px: float
+    per_root_ms: float
+
+    @classmethod
+    def of(cls, stills: Iterable[tuple[int, NDArray[np.float32]]], margin: int) -> Unrest | None:
+        """Measure it from images of a resting lens, (time, levels); ``None`` from fewer than four."""
+        gauge = Gauge(margin)
+        seen = np.array([gauge.look(image, t_us) for t_us, image in stills])
+        if len(seen) < 4:
+            return None
+        before, after = np.triu_indices(len(seen), 2)
+        change = seen[after] - seen[before]
+        squares = float(np.square(change[:, 1]).sum())
+        gone = float(np.square(change[:, 2:4]).sum())
+        return cls(
+            float(np.sqrt(squares / max(gone, LEAST_SHIFT_PX**2 * before.size))),
+            float(np.sqrt(np.mean(np.square(change[:, 1]) / change[:, 0]))),
+        )
 
 
 class Bearing:
@@ -52,69 +127,59 @@ class Bearing:
 
     Parameters
     ----------
-    pictured:
-        Whether the image began as a picture of the scene, not as nothing.
+    unrest:
+        What motion does to the image's sharpness.
     margin:
         Pixels at each side that are left out.
+    beneath:
+        What an image lacks of being a picture of the scene, (height, width) in thresholds: it is added to each.
     again:
         Whether another verdict has turned the lens round: an opposite one must then be more certain.
     """
 
-    def __init__(self, margin: int, *, pictured: bool, again: bool = False) -> None:
-        self._margin = margin // 2
+    def __init__(
+        self, unrest: Unrest, margin: int, beneath: NDArray[np.float32] | None = None, *, again: bool = False
+    ) -> None:
+        self._unrest = unrest
+        self._gauge = Gauge(margin)
+        self._beneath = beneath
         self._doubt = AFTER_REVERSAL if again else 1.0
-        self._pictured = pictured
-        self._seen = 0
-        self._energy = _Swing()
-        self._tilt = _Swing()
+        self._seen: list[Look] = []
         self.direction = Direction.UNKNOWN
         """The first verdict; it stands."""
 
-    def look(self, image: NDArray[np.float32]) -> Direction:
+    def look(self, image: NDArray[np.float32], t_us: int) -> Direction:
         """Take the image, (height, width) in thresholds, at the next tick; return the direction so far."""
         if self.direction is not Direction.UNKNOWN:
             return self.direction
-        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        weight = np.ones_like(half)
-        self._seen += 1
-        if self._pictured:
-            self._energy.add(_log_energy(half, MIDDLE_PX, weight, self._margin))
-            self.direction = self._energy.verdict(RISE, self._doubt * FALL)
-        elif self._seen > UNSETTLED:
-            fine = _log_energy(half, FINE_PX, weight, self._margin)
-            self._energy.add(fine)
-            self._tilt.add(fine - _log_energy(half, COARSE_PX, weight, self._margin))
-            self.direction = self._tilt.verdict(TILT_RISE, self._doubt * TILT_FALL)
-            if self._energy.verdict(np.inf, self._doubt * RISE) is Direction.RECEDING:
-                self.direction = Direction.RECEDING
+        now = self._gauge.look(image if self._beneath is None else image + self._beneath, t_us)
+        if self._seen:
+            took_ms, change, x_px, y_px, variance = (np.array(now) - np.array(self._seen)).T
+            motion = np.maximum(
+                self._unrest.per_px * np.hypot(x_px, y_px), self._unrest.per_root_ms * np.sqrt(np.maximum(took_ms, 0.0))
+            )
+            limit = self._doubt * np.hypot(TIMES_MOTION * motion, SIGMAS_OF_EVENTS * np.sqrt(variance))
+            beyond = np.abs(change) > limit
+            if beyond.any():
+                rises = change[np.argmax(np.abs(change) / (limit + _TINY))] > 0.0
+                self.direction = Direction.APPROACHING if rises else Direction.RECEDING
+        self._seen.append(now)
         return self.direction
 
 
-class _Swing:
-    """A curve's rally from its lowest and drawdown from its highest point."""
+def shift_between(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return how far an image has gone, (x, y) in its pixels, by least squares on its gradient: a fraction of a pixel.
 
-    def __init__(self) -> None:
-        self._values: list[float] = []
-        self._low, self._high = np.inf, -np.inf
-
-    def add(self, value: float) -> None:
-        self._values.append(value)
-        self._low, self._high = min(self._low, value), max(self._high, value)
-
-    def verdict(self, rise: float, fall: float) -> Direction:
-        now = self._values[-1]
-        least = SIGMAS * self._scatter()
-        if now - self._low > max(rise, least):
-            return Direction.APPROACHING
-        if self._high - now > max(fall, least):
-            return Direction.RECEDING
-        return Direction.UNKNOWN
-
-    def _scatter(self) -> float:
-        """One standard deviation of a point about its neighbours."""
-        second = np.diff(self._values, 2)
-        return float(np.sqrt(np.mean(np.square(second)) / 6.0)) if second.size else 0.0
+    Where all edges point one way only the way across them is known; the other component is the least that explains it.
+    """
+    down, right = np.gradient(0.5 * (before + after))
+    change = (after - before).ravel()
+    design = np.stack([right.ravel(), down.ravel()])
+    normal = (design @ design.T).astype(np.float64)
+    inverse = np.linalg.pinv(normal, rcond=1e-6, hermitian=True)
+    return np.asarray(-inverse @ (design @ change).astype(np.float64))
 
 
-def _log_energy(image: NDArray[np.float32], scale_px: float, weight: NDArray[np.float32], margin: int) -> float:
-    return float(np.log(band_energy(image, scale_px, weight, margin) + 1e-12))
+def _shrunk(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    shrunk = cv2.resize(image, None, fx=1.0 / SHRINK, fy=1.0 / SHRINK, interpolation=cv2.INTER_AREA)
+    return np.asarray(shrunk, dtype=np.float32)

@@ -166,9 +166,11 @@ class Detector:
             return
         rally = self._total - self._low
         drawdown = self._high - self._total
+        recede_sigmas = self.recede_sigmas if self.direction is Direction.UNKNOWN else SIGMAS
         if (
             self.direction is not Direction.APPROACHING
             and self._events_since_low >= _MIN_EVENTS_FOR_VERDICT
+            and self._may_exceed(SIGMAS, rally, self._energy_since_low)
             and self.approach_score > SIGMAS
             and (self.direction is Direction.UNKNOWN or rally > RELATIVE_DRAWDOWN * (self._foot - self._low))
         ):
@@ -183,7 +185,8 @@ class Detector:
         elif (
             self.direction is not Direction.RECEDING
             and self._events_since_high >= _MIN_EVENTS_FOR_VERDICT
-            and self.recede_score > (self.recede_sigmas if self.direction is Direction.UNKNOWN else SIGMAS)
+            and self._may_exceed(recede_sigmas, drawdown, self._energy_since_high)
+            and self.recede_score > recede_sigmas
             and (self.direction is Direction.UNKNOWN or drawdown > RELATIVE_DRAWDOWN * (self._high - self._foot))
         ):
             score = self.recede_score
@@ -194,6 +197,10 @@ class Detector:
             self._foot = self._high
             self._low = self._total
             self._energy_since_low, self._events_since_low = 0.0, 0
+
+    def _may_exceed(self, sigmas: float, length: float, energy: float) -> bool:
+        """Say whether a score could be so large, without measuring the overdispersion, which takes long."""
+        return _score(length, max(1.0, self.rest.overdispersion) * energy) > sigmas
 
     def _turn(self, direction: Direction, sample: ElpSample, score: float) -> None:
         self.direction = direction

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.events.evt3 import skip_to_time
-from elpd.events.evt3_lanes import AHEAD, LISTS, LOWS, take_blocks, take_change_of_time, take_timed_blocks
+from elpd.events.evt3_lanes import AHEAD, take_blocks, take_change_of_time, take_timed_blocks
+from elpd.events.evt3_lists import COLUMNS, LISTS, LOWS, ROWS, TIMES
 from elpd.events.jit import kernel
-from elpd.events.lanes import available, weigh
 from elpd.events.registers import HIGH, LOOP, LOW
+from elpd.events.simd import available
+from elpd.vision.elp_gather import to_addresses, weigh, weigh_pixels, widen
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import BEGIN, ELP, ENERGY, LENGTH, N_OFF, N_ON, OUT_OF_SENSOR, OUTSIDE, move_to
 from elpd.vision.elp_words import (
@@ -40,15 +42,27 @@ LOWS_IN_HIGH = 4096
 if available():  # elsewhere it does not compile
 
     @kernel()
-    def _sum_list(lists: NDArray[np.uint32], n: Integer, table: NDArray[np.int16], window: NDArray[np.int64]) -> None:
-        """Add the first *n* events of a list to the open window."""
-        elp, energy, n_inside, n_on, out_of_sensor = weigh(lists, n, table, OUTSIDE_WEIGHT, OUT_OF_SENSOR_WEIGHT)
+    def _add(found: tuple[int, int, int, int, int], n: Integer, window: NDArray[np.int64]) -> None:
+        elp, energy, n_inside, n_on, out_of_sensor = found
         window[ELP] += elp
         window[ENERGY] += energy
         window[N_ON] += n_on
         window[N_OFF] += n_inside - n_on
         window[OUTSIDE] += n - n_inside
         window[OUT_OF_SENSOR] += out_of_sensor
+
+    @kernel()
+    def _sum_list(lists: NDArray[np.uint32], n: Integer, table: NDArray[np.int16], window: NDArray[np.int64]) -> None:
+        """Add the first *n* events of a list of addresses to the open window."""
+        _add(weigh(lists, n, table, OUTSIDE_WEIGHT, OUT_OF_SENSOR_WEIGHT), n, window)
+
+    @kernel()
+    def _sum_pixels(
+        lists: NDArray[np.uint32], n: Integer, table: NDArray[np.int16], last_row: int, window: NDArray[np.int64]
+    ) -> None:
+        """Add the first *n* events of the lists of columns and rows to the open window."""
+        found = weigh_pixels(lists, COLUMNS, ROWS, n, last_row, STRIDE, table, OUTSIDE_WEIGHT, OUT_OF_SENSOR_WEIGHT)
+        _add(found, n, window)
 
     sum_list: Callable[..., None] = _sum_list
 else:
@@ -88,14 +102,14 @@ def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile
             low_until = min(max(since + window[LENGTH], low_from), LOWS_IN_HIGH)
             if capped:
                 position, n, stopped = take_timed_blocks(
-                    words, position, state, triggers, low_from, low_until, last_row, STRIDE, lists, ledger
+                    words, position, state, triggers, low_from, low_until, lists, ledger
                 )
-                sum_capped(lists, lists, LOWS, base, n, table, window, bucket)
+                to_addresses(lists, COLUMNS, ROWS, n, last_row, STRIDE, 0)
+                widen(lists, LOWS, n, TIMES)
+                sum_capped(lists, lists, TIMES, base, n, table, window, bucket)
             else:
-                position, n, stopped = take_blocks(
-                    words, position, state, triggers, low_from, low_until, last_row, STRIDE, lists, ledger
-                )
-                sum_list(lists, n, table, window)
+                position, n, stopped = take_blocks(words, position, state, triggers, low_from, low_until, lists, ledger)
+                _sum_pixels(lists, n, table, last_row, window)
             if not stopped:
                 continue
             take_change_of_time(words[position], state)

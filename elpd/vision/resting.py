@@ -1,9 +1,11 @@
 """What a sensor says while lens and scene rest: its noise, its hot pixels, and whether the light flickers.
 
 A few milliseconds before a sweep are enough for noise and hot pixels. Where the signs of events swing together more
-than independent signs would, somebody should listen a little longer (``restless``): a lamp needs several periods to be
-told from a hand that shakes. Where signs lie together as those of one moving edge do, the scene moves, and its image
-is gone on with when the sweep begins.
+than independent signs would, or lie together more than they do by chance, somebody should listen a little longer
+(``restless``): a lamp needs several periods to be told from a hand that shakes, and a dull scene some hundred events.
+Where signs lie together as those of one moving edge do, the scene moves: then its image is gone on with when the sweep
+begins, on a picture that is laid where the scene is now, and what motion alone does to the image's sharpness is
+measured.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from elpd.vision.alignment import laid_on
+from elpd.vision.bearing import Unrest
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
 from elpd.vision.flicker import find_flicker, residue
@@ -21,7 +25,7 @@ from elpd.vision.track import frame_levels
 from elpd.vision.whole_periods import WholePeriods
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -43,12 +47,19 @@ HOT_EVENTS = 3.0
 """A pixel is hot where it fires this many standard deviations and events more often than its second busiest neighbour:
 an edge that trembles makes neighbours fire alike. By chance one in 10⁸ pixels does."""
 
+SIGMAS_OF_SUSPICION = 2.0
+"""Order above which it is worth while to listen longer, one still scene in forty-four pays for it; and above which,
+after that, the direction is not left to a product that motion deceives."""
+
 SIGMAS_OF_MOTION = 4.0
 """How much more order than independent events have shows that the scene moved while the lens stood still. A false
 alarm costs a second pass."""
 
 ORDER_PX = 2.4
 """Scale at which events of one moving edge agree, in a picture that is out of focus."""
+
+STILL_US = 1_000
+"""Between two looks at the image of a resting lens: a tick of a sweep takes about as long."""
 
 
 class Resting:
@@ -58,9 +69,13 @@ class Resting:
     ----------
     roi, geometry:
         The region and the sensor.
+    picture:
+        Makes an earlier picture of the whole sensor, log brightness in contrast thresholds; asked where the scene moves
+        and no frame has come.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry) -> None:
+    def __init__(self, roi: Roi, geometry: Geometry, picture: Callable[[], NDArray[np.float32]] | None = None) -> None:
+        self._picture = picture
         self._geometry = geometry
         self._inside = _box(roi, geometry, 0)
         self.heard = _box(roi, geometry, ROI_MARGIN_PX)
@@ -83,7 +98,11 @@ class Resting:
         self.moves = False
         """Whether the events lie together as those of a moving scene do, known after ``settle``."""
         self.image_at_start: BuiltImage | None = None
-        """Where the scene moves, what it looks like now: a frame and the events since, or the events alone."""
+        """Where the scene moves, what has been built: upon a frame, or by the events alone."""
+        self.beneath: NDArray[np.float32] | None = None
+        """What that image lacks of being a picture of the scene, where motion is only suspected too."""
+        self.unrest: Unrest | None = None
+        """What motion alone does to the sharpness of the two together; ``None`` where there is no picture."""
 
     def add(
         self,
@@ -112,11 +131,13 @@ class Resting:
 
     @property
     def restless(self) -> bool:
-        """Whether ON and OFF events swing together more than independent ones would."""
-        t_us, _, on = self._events()
+        """Whether ON and OFF events swing together, or lie together, more than independent ones would."""
+        t_us, pixel, on = self._events()
         bins = self.duration_us // RESTLESS_BIN_US
         if bins < 3 or t_us.size < bins:
             return False
+        if order(self._levels(pixel, on)) > SIGMAS_OF_SUSPICION:
+            return True
         which = np.clip((t_us - (self._begin_us or 0)) // RESTLESS_BIN_US, 0, bins - 1)
         sign = 2.0 * on - 1.0
         mean = float(sign.mean())
@@ -163,15 +184,34 @@ class Resting:
 
     def _look_for_motion(self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> None:
         levels = self._levels(pixel, on)
-        self.moves = order(levels) > SIGMAS_OF_MOTION
-        if not self.moves:
+        found = order(levels)
+        self.moves = found > SIGMAS_OF_MOTION
+        if found <= SIGMAS_OF_SUSPICION:
             return
-        if self._frame is None:
-            self.image_at_start = BuiltImage(levels, t_us.size)
-            return
-        since = t_us >= self._frame.t_us
-        levels = self._levels(pixel[since], on[since]) + self._cut(frame_levels(self._frame.pixels))
-        self.image_at_start = BuiltImage(levels, int(since.sum()), pictured=True)
+        built, before = BuiltImage(levels, t_us.size), None
+        if self._frame is not None:
+            since = t_us >= self._frame.t_us
+            now = self._cut(frame_levels(self._frame.pixels)) + self._levels(pixel[since], on[since])
+            built, before = BuiltImage(now, int(since.sum())), now - levels
+        elif self._picture is not None:  # in the middle of the rest it lies where events are best explained
+            picture = self._cut(self._picture())
+            before = self.beneath = laid_on(picture, levels) - np.float32(0.5) * levels
+        if before is not None:
+            self.unrest = Unrest.of(self._stills(before, t_us, pixel, on), ROI_MARGIN_PX)
+        if self.moves:
+            self.image_at_start = built
+        elif before is not None:  # nothing is gone on with, so all of it is lacking
+            self.beneath = before + levels
+
+    def _stills(
+        self, before: NDArray[np.float32], t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8]
+    ) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield what the scene looked like while nothing else moved: upon the image *before* it, step by step."""
+        image, begin = before, 0
+        for until_us in range((self._begin_us or 0) + STILL_US, self._end_us + 1, STILL_US):
+            end = int(np.searchsorted(t_us, until_us, side="left"))
+            image, begin = image + self._levels(pixel[begin:end], on[begin:end]), end
+            yield until_us, image
 
     def _levels(self, pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the image that events build, of the region and its margin, in thresholds."""

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from elpd.events.stream import PacketDecoder
-from elpd.ports import Biases, HardwareRoi
-from elpd.records import BiasSet, Roi
+from elpd.ports import Biases, HardwareRoi, Inertial
+from elpd.records import BiasSet, ImuSample, Roi
 from elpd.timebase import MonotonicClock, SensorClock
 
 DRIVER = os.environ.get("ELPD_HARDWARE", "")
@@ -35,12 +35,14 @@ def test_a_live_camera_speaks_all_the_time_and_obeys_its_window() -> None:
             camera.apply_biases(BiasSet.FOCUS)
         if isinstance(camera, HardwareRoi):
             camera.set_window(window)
+        inertia: list[ImuSample] = []
         begun = before = time.monotonic()
         while time.monotonic() < begun + 3:
             packet = camera.read(0.1)
             if packet is None:
                 continue
             now = time.monotonic()
+            inertia += packet.imu
             silences_ms.append(1e3 * (now - before))
             before = now
             events = decoder.feed(packet)
@@ -53,6 +55,10 @@ def test_a_live_camera_speaks_all_the_time_and_obeys_its_window() -> None:
                 assert events.y.max() < window.y + window.height
         print(f"{len(silences_ms)} packets, {np.percentile(silences_ms, [50, 99, 100])} ms apart")  # noqa: T201
         print(f"clock: {clock.drift_ppm:.1f} ppm, bound {clock.bound_us:.1f} us; {dict(camera.counters)}")  # noqa: T201
+        if isinstance(camera, Inertial):
+            felt = np.median([np.linalg.norm(one.acceleration_m_s2) for one in inertia])
+            print(f"{len(inertia)} inertial samples, {felt:.2f} m/s^2")  # noqa: T201
+            assert 8 < felt < 12, "a camera that rests feels gravity"
         assert max(silences_ms) < 50, "a sweep would have been ended"
         assert camera.counters["gaps"] == 0
     finally:

@@ -20,6 +20,7 @@ _ADC_STATUS, _ADC_DONE = 0x50, 1 << 11
 _TIME_BASE, _ROI_CONTROL, _OUT_OF_RESET = 0x9008, 0x4, 1 << 10
 ROI_X, ROI_Y, DIGITAL_MASK = 0x2000, 0x4000, 0x9100
 RATE_ENABLE, RATE_EVENTS, BIAS_DIFF_ON = 0x6028, 0x600C, 0x1010
+_PIPELINE, _TRIGGER = 0x7004, 1 << 10
 
 
 class Evk4:
@@ -49,6 +50,10 @@ class Evk4:
         """Let the next request for events fail, as an endpoint does that has lost its way."""
         self._stream.stall()
 
+    def forget(self) -> None:
+        """Drop the packets that wait for the host to ask."""
+        self._stream.forget()
+
     def answer_when_sent(self) -> None:
         """Answer frames again once the host has taken every packet of events."""
         self._answer_then = True
@@ -57,6 +62,11 @@ class Evk4:
     def streaming(self) -> bool:
         """Whether the host has started the sensor: its clock runs and its pixels are not held in reset."""
         return bool(self.registers.get(_TIME_BASE, 0) & 1 and self.registers.get(_ROI_CONTROL, 0) & _OUT_OF_RESET)
+
+    @property
+    def listening(self) -> bool:
+        """Whether edges on the trigger input come between the events."""
+        return bool(self.registers.get(_PIPELINE, 0) & _TRIGGER)
 
     @property
     def unsent(self) -> int:

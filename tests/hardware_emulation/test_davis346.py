@@ -13,7 +13,7 @@ from elpd_drivers.cameras import neuromorphic
 from hardware_emulation import usbfs
 from hardware_emulation.davis346 import ADC_MHZ, EXPOSURE, FRAME_INTERVAL, MASKED_COLUMNS, MASKED_ROWS, RUN, Davis346
 from hardware_emulation.davis346 import ON_THRESHOLD as ON_BIAS
-from hardware_emulation.davis_words import Encoder, Sample, frame_blocks
+from hardware_emulation.davis_words import ON, ROW, Encoder, Sample, frame_blocks
 from shared import RECORDINGS, needs_shared
 
 from elpd.errors import CameraError
@@ -289,16 +289,29 @@ def test_what_the_usb_loses_is_a_gap_and_counted(rig: Rig) -> None:
     with closing(neuromorphic.open_camera({**SETTINGS, "usb_packets": 33}, MonotonicClock())) as camera:
         camera.start()
         words, gaps, number = Encoder(), 0, 0
+        burst = np.full(WORDS_OF_A_BUFFER - 1, ON | 5, "<u2")
+        burst[0] = ROW | 7
         until = time.monotonic() + PATIENCE_S
-        while gaps == 0 or camera.counters["usb_packets_dropped"] == 0:
+        while gaps == 0 or not (camera.counters["usb_packets_dropped"] and camera.counters["usb_overflows"]):
             assert time.monotonic() < until, "nothing was lost"
             if rig.davis.unsent < 20:
                 number += 1
-                words.events([(1000 * number, x % WIDTH, number % HEIGHT, True) for x in range(WORDS_OF_A_BUFFER - 2)])
+                words.block(1000 * number, burst)
                 rig.davis.send(words.take(), "events")
             packet = camera.read(0)
             gaps += packet is not None and packet.gap_before
-        assert camera.counters["usb_overflows"] >= 1
+    rig.davis.forget()
+
+
+def test_a_camera_that_another_program_holds_says_so(rig: Rig) -> None:
+    rig.lost = True
+    rig.camera.close()
+    rig.bus.claimed.set()
+    try:
+        with pytest.raises(CameraError, match=r"another program holds it; close that one first, `elpd check` names it"):
+            neuromorphic.open_camera(SETTINGS, MonotonicClock())
+    finally:
+        rig.bus.claimed.clear()
 
 
 def test_unplugged_and_plugged_in_again(started: Rig) -> None:
@@ -325,7 +338,9 @@ def test_unplugged_and_plugged_in_again(started: Rig) -> None:
 
 
 def test_a_stalled_endpoint_is_a_lost_camera(started: Rig) -> None:
-    started.lost = True
     started.davis.stall()
     with pytest.raises(CameraError, match="its USB endpoint stalled; unplug it and plug it in again"):
         started.wait_for(lambda: False)
+    started.begin_anew()
+    started.words.events([(1000, 2, 3, True)])
+    assert started.hear("events").columns == [[1000], [2], [3], [True]]

@@ -11,6 +11,7 @@ import pytest
 import usb.backend.libusb1
 from elpd_drivers.cameras.refusals import udev_rule
 from hardware_emulation import usbfs
+from hardware_emulation.davis346 import Davis346
 from hardware_emulation.evk4 import VENDOR, Evk4
 
 pytestmark = [
@@ -32,14 +33,20 @@ def look(bus: usbfs.Bus) -> list[dict[str, object]]:
     return found
 
 
-def test_a_camera_is_seen_when_it_is_plugged_in_and_only_then() -> None:
-    evk4 = Evk4()
+@pytest.mark.parametrize(
+    ("plugged", "name"),
+    [
+        (Evk4(), "Prophesee EVK4 or EVK3 HD (04b4:00f5)"),
+        (Davis346(), "iniVation DAVIS or DVXplorer (152a:841a)"),
+    ],
+)
+def test_a_camera_is_seen_when_it_is_plugged_in_and_only_then(plugged: Evk4 | Davis346, name: str) -> None:
     with usbfs.Bus() as bus:
         assert look(bus) == []
-        bus.plug(evk4)
+        bus.plug(plugged)
         (camera,) = look(bus)
-        assert (camera["name"], camera["where"]) == ("Prophesee EVK4 or EVK3 HD (04b4:00f5)", "/dev/bus/usb/002/002")
-        assert evk4.writes == 0, "looking opens nothing"
+        assert (camera["name"], camera["where"]) == (name, "/dev/bus/usb/002/002")
+        assert not plugged.registers, "looking opens nothing"
         bus.unplug()
         assert look(bus) == []
 

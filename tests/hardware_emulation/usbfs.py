@@ -29,6 +29,7 @@ PRELOAD = "libumockdev-preload.so.0"
 _WORDS = struct.Struct("=3Q")
 _IOCTL, _DONE, _READ_MEMORY, _WRITE_MEMORY = 1, 3, 5, 6
 _SUBMIT, _DISCARD, _REAP, _REAP_NO_DELAY, _CAPABILITIES = 10, 11, 12, 13, 26
+_CLAIM = 15
 _ACCEPTED = {3, 4, 5, 15, 16, 20, 21, 22, 23, 27}  # claim, release, reset, clear halt and the like
 _URB = struct.Struct("=BBxxiIxxxxQiiiiiIQ")
 _STATUS_AT, _ACTUAL_AT = 4, 28
@@ -92,6 +93,8 @@ class Bus:
         self.environment = {"UMOCKDEV_DIR": str(self.root), "LD_PRELOAD": PRELOAD}
         self._number = 1
         self._port: _Port | None = None
+        self.claimed = threading.Event()
+        """While set, another program has claimed the device's interface."""
 
     def __enter__(self) -> Self:
         return self
@@ -107,7 +110,7 @@ class Bus:
         """Plug *device* in, under a new device number as the kernel gives."""
         self._number += 1
         name = f"bus/usb/002/{self._number:03d}"
-        self._port = _Port(device, self.root / "ioctl/dev" / name)
+        self._port = _Port(device, self.root / "ioctl/dev" / name, self.claimed)
         node = self.root / "dev" / name
         node.write_bytes(device.descriptors)
         node.chmod(mode)
@@ -147,8 +150,8 @@ class Bus:
 class _Port:
     """The socket behind one device node."""
 
-    def __init__(self, device: Device, path: Path) -> None:
-        self._device = device
+    def __init__(self, device: Device, path: Path, claimed: threading.Event) -> None:
+        self._device, self.claimed = device, claimed
         self.gone = False
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(path))
@@ -197,6 +200,8 @@ class _OpenDevice:
             return errno.ENODEV
         if number == _SUBMIT:
             return self._submit(argument)
+        if number == _CLAIM and self._port.claimed.is_set():
+            return errno.EBUSY
         if number == _CAPABILITIES:
             self._write(argument, struct.pack("=I", _NO_PACKET_SIZE_LIMIT | _REAP_AFTER_DISCONNECT))
             return 0

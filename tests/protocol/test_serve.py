@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import queue
 import signal
-import socket
 import subprocess
-import sys
-import threading
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
+from served import ELPD, PATIENCE_S, Connection, Served, serving_in
 
 from elpd.cli.sim_board import find_board
 
@@ -21,109 +16,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-ELPD = (sys.executable, "-c", "from elpd.cli import main; main()")
-PATIENCE_S = 120.0
-"""A machine that runs a test on every core compiles kernels slowly."""
-
-
-@dataclass
-class Served:
-    """A daemon and a connection to it."""
-
-    process: subprocess.Popen[str]
-    folder: Path
-    heard: queue.Queue[str]
-    hello: dict[str, Any]
-    connections: list[Connection] = field(default_factory=list)
-
-    def connect(self) -> Connection:
-        """Open another connection; the fixture closes it."""
-        self.connections.append(Connection(self.hello["socket"]))
-        return self.connections[-1]
-
-    def heard_until(self, word: str) -> str:
-        """Return the next datagram for the supervisor that begins with a word."""
-        while not (told := self.heard.get(timeout=PATIENCE_S)).startswith(word):
-            pass
-        return told
-
-    def end(self) -> int:
-        """Ask it to end, and see how it does."""
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(PATIENCE_S)
-
-
-class Connection:
-    """One JSON object a line, each way."""
-
-    def __init__(self, path: str) -> None:
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(PATIENCE_S)
-        self._socket.connect(path)
-        self._lines = self._socket.makefile("rwb")
-
-    def send(self, method: str, **params: Any) -> None:
-        self._lines.write(json.dumps({"id": 1, "method": method, "params": params}).encode() + b"\n")
-        self._lines.flush()
-
-    def receive(self) -> dict[str, Any]:
-        answer: dict[str, Any] = json.loads(self._lines.readline())
-        return answer
-
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        self.send(method, **params)
-        return self.receive()
-
-    def until(self, event: str, **fields: Any) -> dict[str, Any]:
-        while True:
-            told = self.receive()
-            if told.get("event") == event and all(told.get(key) == value for key, value in fields.items()):
-                return told
-
-    def close(self) -> None:
-        self._lines.close()
-        self._socket.close()
-
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
-    begun: list[Served] = []
-    supervisors: list[socket.socket] = []
-
-    def begin(*overrides: str) -> Served:
-        supervisor = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        supervisor.bind(str(tmp_path / f"notify-{len(begun)}"))
-        supervisors.append(supervisor)
-        (tmp_path / "elpd.toml").write_text(
-            f'[api]\nsocket = "{tmp_path}/elpd.sock"\n[journal]\ndirectory = "{tmp_path}/runs"\n'
-            f'[state]\ndirectory = "{tmp_path}/state"\n[sim]\nwidth = 320\nheight = 240\nscene = "camera"\nseed = 3\n'
-        )
-        settings = [word for override in overrides for word in ("--set", override)]
-        process = subprocess.Popen(
-            [*ELPD, "serve", "--json", "--config", str(tmp_path / "elpd.toml"), *settings],
-            env={**os.environ, "NOTIFY_SOCKET": supervisor.getsockname(), "WATCHDOG_USEC": "2000000"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert line, process.communicate()[1]
-        heard: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=_read_all, args=(supervisor, heard), daemon=True).start()
-        served = Served(process, tmp_path, heard, json.loads(line))
-        begun.append(served)
-        return served
-
-    yield begin
-    for served in begun:
-        for connection in served.connections:
-            connection.close()
-        if served.process.poll() is None:
-            served.process.kill()
-        served.process.communicate()
-    for supervisor in supervisors:
-        supervisor.sendto(b"", supervisor.getsockname())
+    with serving_in(tmp_path) as begin:
+        yield begin
 
 
 def test_a_daemon_serves_tells_its_supervisor_and_ends_in_order(serve: Callable[..., Served]) -> None:
@@ -189,14 +86,12 @@ def test_sighup_takes_a_good_configuration_and_refuses_a_bad_one(serve: Callable
     daemon.heard_until("RELOADING=1")
     daemon.heard_until("READY=1")
     connection = daemon.connect()
-    warnings = connection.call("status")["result"]["warnings"]
-    assert [one["code"] for one in warnings] == ["config-refused"]
-    assert "elpd.toml:13" in warnings[0]["text"]
+    assert "elpd.toml:13" in warned(connection)["config-refused"]
     path.write_text(good + "[focus]\ndeadline_ms = 1\n")
     daemon.process.send_signal(signal.SIGHUP)
     daemon.heard_until("RELOADING=1")
     daemon.heard_until("READY=1")
-    assert connection.call("status")["result"]["warnings"] == []
+    assert "config-refused" not in warned(connection)
     assert connection.call("focus")["result"]["outcome"] == "DEADLINE"
 
 
@@ -241,11 +136,9 @@ def test_parking_stops_a_lens_that_nobody_drives_any_more() -> None:
     }
 
 
-def _read_all(supervisor: socket.socket, heard: queue.Queue[str]) -> None:
-    """Read as systemd does: at once, so that nothing is lost."""
-    with supervisor:
-        while told := supervisor.recv(4096):
-            heard.put(told.decode())
+def warned(connection: Connection) -> dict[str, str]:
+    """Return the warnings of a daemon by their codes; a busy machine has one of its own."""
+    return {one["code"]: one["text"] for one in connection.call("status")["result"]["warnings"]}
 
 
 def _elpd(*arguments: str) -> subprocess.CompletedProcess[str]:

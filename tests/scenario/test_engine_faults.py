@@ -137,6 +137,43 @@ def test_a_daemon_that_was_killed_comes_back_unreferenced_and_does_not_move(tmp_
     assert third.status.lens.referenced is True, "an end in order leaves nothing to doubt"
 
 
+def test_a_crash_loop_moves_nothing_and_is_not_forgotten(tmp_path: Path) -> None:
+    Daemon(tmp_path).begin().ask("move", fraction=1.0)  # and then SIGKILL, as after each of the next
+    for _ in range(5):
+        again = Daemon(tmp_path, "modes.start=continuous").begin()
+        steps = again.steps
+        again.run(1.0)
+        assert again.steps == steps
+        assert again.status.lens.referenced is False
+        assert isinstance(again.refused("focus"), UnreferencedError)
+        assert [warned.code for warned in again.status.warnings] == ["ended-badly"]
+    again.do("home")
+    assert again.status.warnings == []
+    again.end()
+    last = Daemon(tmp_path).begin()
+    last.run(0.1)
+    assert last.status.lens.referenced is True
+
+
+@pytest.mark.parametrize("broken", [RuntimeError("a mistake of the driver's own"), MemoryError()])
+def test_what_nobody_expects_in_a_cycle_is_a_fault_with_the_lens_at_rest(tmp_path: Path, broken: Exception) -> None:
+    daemon = Daemon(tmp_path).begin()
+
+    def fail() -> None:
+        raise broken
+
+    daemon.at_phase("sweep", 10.0, fail)
+    asked = daemon.until_answered(daemon.ask("focus"))
+    assert asked.kind == "InternalError"
+    assert daemon.status.state == "FAULT"
+    daemon.run(1.0)
+    assert daemon.velocity == 0.0
+    assert daemon.status.camera.connected, "the rig was opened anew"
+    daemon.do("clear")
+    daemon.do("home")
+    assert daemon.do("focus").outcome == "FOCUSED"
+
+
 def test_continuous_mode_does_not_begin_by_itself_after_a_start(tmp_path: Path) -> None:
     first = Daemon(tmp_path).begin()
     first.do("mode", mode="continuous")
@@ -213,7 +250,7 @@ def test_a_state_that_is_damaged_is_told_and_the_copy_of_before_is_used(tmp_path
     path.write_bytes(path.read_bytes()[:-20])
     again = Daemon(tmp_path).begin()
     assert again.do("roi").roi.x == 0
-    assert [warned.code for warned in again.status.warnings] == ["state-damaged"]
+    assert {warned.code for warned in again.status.warnings} == {"state-damaged", "ended-badly"}
 
 
 def test_old_runs_go_when_all_together_are_too_large(tmp_path: Path) -> None:

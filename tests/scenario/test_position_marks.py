@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from elpd_drivers.sim.boards import avr
+from elpd_drivers.sim.camera import SimulatedCamera
 from elpd_drivers.sim.rig import SimulatedTruth
+from marks import ADAPTER_NS, worst_at_speed
 from scenarios import SMALL
+from through_backends import through_davis, through_metavision
 
 from elpd import rig
 from elpd.config import load
@@ -16,15 +19,13 @@ from elpd.errors import ConfigError
 from elpd.focus.cycle import FocusCycle
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.records import FocusResult, Outcome
-from elpd.units import NS_PER_MS, HostNs
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from elpd.ports import RigParts
 
 pytestmark = pytest.mark.skipif(avr.hindrance() is not None, reason=str(avr.hindrance()))
-CRUISE_SPS = 12_000.0
-ADAPTER_NS = 400_000
-"""How long the adapter takes to pass a command on, which nobody has told the driver."""
 
 
 class Listener:
@@ -32,26 +33,15 @@ class Listener:
         pass
 
 
-def focus(*overrides: str) -> tuple[RigParts, FocusResult]:
+def focus(*overrides: str, through: Callable[[SimulatedCamera], Any] | None = None) -> tuple[RigParts, FocusResult]:
     config = load(None, [*SMALL, "sim.board=avr", "sim.seed=11", *overrides])
     parts = rig.build(config)
     assert isinstance(parts.truth, SimulatedTruth)
+    if through is not None:
+        assert isinstance(parts.camera, SimulatedCamera)
+        parts = replace(parts, camera=through(parts.camera))
     parts.truth.port.wire._latency_ns = ADAPTER_NS
     return parts, FocusCycle(parts, CycleSettings.from_config(config), FocusRequest(), Listener()).run()
-
-
-def worst_at_speed(parts: RigParts) -> float:
-    """Return the largest error of the lens's own position, in steps, while it swept at its full speed."""
-    assert isinstance(parts.truth, SimulatedTruth)
-    motor, now = parts.truth.mechanism, parts.clock.now_ns()
-    worst = 0.0
-    for ms in range(30, 215):
-        when = HostNs(now - ms * NS_PER_MS)
-        around = np.array([when - NS_PER_MS, when, when + NS_PER_MS])
-        true = motor.motor_steps(around)
-        if abs(true[2] - true[1]) > CRUISE_SPS / 1000 and abs(true[1] - true[0]) > CRUISE_SPS / 1000:
-            worst = max(worst, abs(parts.lens.position_at(when).steps - float(true[1])))
-    return worst
 
 
 @pytest.mark.parametrize("camera", ["evk4", "davis346"])
@@ -61,6 +51,18 @@ def test_with_marks_an_unknown_latency_does_not_matter(camera: str) -> None:
     assert first.outcome is second.outcome is Outcome.FOCUSED
     assert not any("trigger input" in warning for warning in second.warnings)
     assert worst_at_speed(plain) > 1.0
+    assert worst_at_speed(marked) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("camera", "through"), [("evk4", through_metavision), ("davis346", through_davis)], ids=["metavision", "davis"]
+)
+def test_edges_of_a_live_backend_reach_the_lens_as_marks(
+    camera: str, through: Callable[[SimulatedCamera], Any]
+) -> None:
+    marked, result = focus(f"sim.camera={camera}", "sim.sync_steps=64", through=through)
+    assert result.outcome is Outcome.FOCUSED
+    assert not any("trigger input" in warning for warning in result.warnings)
     assert worst_at_speed(marked) < 0.2
 
 

@@ -232,6 +232,34 @@ def test_a_hang_ends_in_a_traceback_that_names_it_and_a_restart(controller: Cont
     assert lens["position_um"] < 15000.0
 
 
+def test_a_process_that_is_frozen_in_mid_move_is_ended_and_the_lens_stopped(controller: Controller) -> None:
+    restarts, begun = int(controller.show("NRestarts")[0]), len(controller.journal("ELPD_EVENT=rig open"))
+    asked = controller.moving()
+    controller.machine("systemctl", "kill", "--signal=STOP", "--kill-whom=main", "elpd")  # and no SIGCONT
+    controller.machine.until(lambda: int(controller.show("NRestarts")[0]) > restarts, "the watchdog")
+    controller.machine.until(lambda: len(controller.journal("ELPD_EVENT=rig open")) > begun, "the controller's return")
+    asked.communicate(timeout=120)
+    lens = controller.resting()
+    assert not lens["referenced"]
+    assert lens["position_um"] < 15000.0
+    assert [warned["code"] for warned in controller.status()["warnings"]].count("ended-badly") == 1
+
+
+def test_out_of_memory_in_mid_move_is_a_clean_restart(controller: Controller) -> None:
+    begun = len(controller.journal("ELPD_EVENT=rig open"))
+    asked = controller.moving()
+    with controller.machine.starved("elpd.service") as killed:
+        controller.machine.until(killed, "the kernel's out-of-memory killer")
+    controller.machine.until(lambda: len(controller.journal("ELPD_EVENT=rig open")) > begun, "the controller's return")
+    asked.communicate(timeout=120)
+    assert any("at rest" in line["MESSAGE"] for line in controller.journal("_TRANSPORT=stdout"))
+    lens = controller.resting()
+    assert not lens["referenced"]
+    assert lens["position_um"] < 15000.0
+    assert controller.call("move", to_um=100.0)["error"]["kind"] == "Unreferenced"
+    assert "result" in controller.call("home")
+
+
 def test_a_configuration_that_is_wrong_is_refused_and_the_old_one_stays(controller: Controller) -> None:
     (pid,) = controller.show("MainPID")
     limits = controller.status()["lens"]["limits_um"]

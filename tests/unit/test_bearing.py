@@ -11,18 +11,22 @@ import pytest
 from elpd.events.decoder import EventArrays
 from elpd.records import Direction, Frame, Geometry, Roi
 from elpd.units import SensorUs
-from elpd.vision.bearing import Bearing
+from elpd.vision.alignment import displacement_px, laid_on, moved
+from elpd.vision.bearing import Bearing, Gauge, Unrest
 from elpd.vision.integral import band_energy, band_gain, band_patch
 from elpd.vision.memory import EventMemory
 from elpd.vision.resting import Resting, order
 from elpd.vision.track import FrameEnergy, frame_levels
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
 SIZE = 96
 ROI = Roi(0, 0, SIZE, SIZE)
 GEOMETRY = Geometry(SIZE, SIZE)
+MARGIN = 14
 
 
 def scene(blur_px: float, shift_px: int = 0, seed: int = 3) -> NDArray[np.float32]:
@@ -38,50 +42,109 @@ def events_at(seed: int, count: int, on: NDArray[np.uint8] | None = None) -> Eve
     return EventArrays(np.arange(count, dtype=np.int64) * 20, x, y, p)
 
 
+def path(seed: int, looks: int = 30) -> NDArray[np.int64]:
+    """Return where a scene that trembles has gone, in pixels."""
+    return np.random.default_rng(seed).integers(-1, 2, size=looks).cumsum()
+
+
+def unrest(seed: int = 1, blur_px: float = 4.5) -> Unrest:
+    stills = [(1000 * k, scene(blur_px, int(shift))) for k, shift in enumerate(path(seed, 12))]
+    found = Unrest.of(stills, MARGIN)
+    assert found is not None
+    return found
+
+
+def judged(bearing: Bearing, images: Iterable[NDArray[np.float32]]) -> Direction:
+    for k, image in enumerate(images):
+        bearing.look(image, 1000 * k)
+    return bearing.direction
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("end_px", "direction"), [(2.0, Direction.APPROACHING), (8.0, Direction.RECEDING)])
 def test_a_picture_that_shakes_tells_the_direction(seed: int, end_px: float, direction: Direction) -> None:
-    bearing = Bearing(14, pictured=True)
-    shifts = np.random.default_rng(seed).integers(-1, 2, size=30).cumsum()
-    for blur, shift in zip(np.linspace(4.5, end_px, 30), shifts, strict=True):
-        bearing.look(scene(float(blur), int(shift)))
-    assert bearing.direction is direction
+    images = [scene(float(blur), int(at)) for blur, at in zip(np.linspace(4.5, end_px, 30), path(seed), strict=True)]
+    assert judged(Bearing(unrest(seed + 10), MARGIN), images) is direction
 
 
-def test_shaking_alone_is_no_direction() -> None:
-    bearing = Bearing(14, pictured=True)
-    for shift in np.random.default_rng(5).integers(-1, 2, size=30).cumsum():
-        bearing.look(scene(4.0, int(shift)))
-    assert bearing.direction is Direction.UNKNOWN
+@pytest.mark.parametrize("seed", range(4))
+def test_shaking_alone_is_no_direction(seed: int) -> None:
+    images = [scene(4.5, int(at)) for at in path(seed)]
+    assert judged(Bearing(unrest(seed + 10), MARGIN), images) is Direction.UNKNOWN
 
 
-@pytest.mark.parametrize(("end_px", "direction"), [(1.0, Direction.APPROACHING), (9.0, Direction.RECEDING)])
-def test_the_difference_from_the_start_tells_it_too(end_px: float, direction: Direction) -> None:
-    bearing = Bearing(14, pictured=False)
+def test_what_the_image_lacks_of_a_picture_is_added() -> None:
     start = scene(4.5)
-    for k, blur in enumerate(np.linspace(4.5, end_px, 40)):
-        bearing.look(scene(float(blur), k // 2) - start)
-    assert bearing.direction is direction
+    images = [scene(float(blur), k // 2) - start for k, blur in enumerate(np.linspace(4.5, 8.0, 30))]
+    assert judged(Bearing(unrest(), MARGIN, start), images) is Direction.RECEDING
+
+
+def test_more_unrest_needs_more_change() -> None:
+    images = [scene(4.5) * np.float32(np.exp(-0.5 * fall)) for fall in np.linspace(0.0, 0.1, 12)]
+    assert judged(Bearing(Unrest(0.0, 0.005), MARGIN), images) is Direction.RECEDING
+    assert judged(Bearing(Unrest(0.0, 0.05), MARGIN), images) is Direction.UNKNOWN
+
+
+def test_a_change_that_events_make_by_chance_is_no_direction() -> None:
+    rng = np.random.default_rng(4)
+    image, images = scene(4.5), []
+    for _ in range(20):
+        image = image + rng.integers(-1, 2, size=image.shape).astype(np.float32)
+        images.append(image)
+    assert judged(Bearing(Unrest(0.0, 0.0), MARGIN), images[:3]) is Direction.UNKNOWN
 
 
 def test_a_verdict_stands() -> None:
-    bearing = Bearing(14, pictured=True)
-    for blur in (4.5, 4.0, 3.0, 2.0, 4.0, 6.0, 9.0):
-        bearing.look(scene(blur))
-    assert bearing.direction is Direction.APPROACHING
+    images = [scene(blur) for blur in (4.5, 4.0, 3.0, 2.0, 4.0, 6.0, 9.0)]
+    assert judged(Bearing(Unrest(0.01, 0.01), MARGIN), images) is Direction.APPROACHING
 
 
 def test_after_a_reversal_the_same_fall_is_not_enough() -> None:
-    first, again = Bearing(14, pictured=True), Bearing(14, pictured=True, again=True)
-    for fall in np.linspace(0.0, 0.1, 12):
-        first.look(scene(4.5) * np.float32(np.exp(-float(fall) / 2)))
-        again.look(scene(4.5) * np.float32(np.exp(-float(fall) / 2)))
-    assert first.direction is Direction.RECEDING
-    assert again.direction is Direction.UNKNOWN
+    images = [scene(4.5) * np.float32(np.exp(-0.5 * fall)) for fall in np.linspace(0.0, 0.12, 12)]
+    first, again = (Bearing(Unrest(0.0, 0.01), MARGIN, again=again) for again in (False, True))
+    assert judged(first, images) is Direction.RECEDING
+    assert judged(again, images) is Direction.UNKNOWN
 
 
-def rested(events: EventArrays, *frames: Frame) -> Resting:
-    resting = Resting(ROI, GEOMETRY)
+def test_too_few_stills_tell_nothing_of_unrest() -> None:
+    assert Unrest.of([(1000 * k, scene(4.5)) for k in range(3)], MARGIN) is None
+
+
+def test_the_scenes_travel_is_measured_from_look_to_look() -> None:
+    gauge = Gauge(MARGIN)
+    looks = [gauge.look(scene(4.5, shift), 1000 * shift) for shift in range(7)]
+    assert looks[-1].x_px == pytest.approx(-6.0, rel=0.25)  # in proportion: rest and sweep alike
+    assert looks[-1].y_px == pytest.approx(0.0, abs=0.3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_picture_is_found_where_events_show_its_gradient(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x_px, y_px = (int(one) for one in rng.integers(-8, 9, size=2))
+    picture = scene(4.5, seed=seed) / np.float32(2.0)
+    before, after = (moved(picture, x_px + part, y_px + part) for part in (-0.5, 0.5))
+    change = np.rint(after - before + rng.uniform(-0.5, 0.5, picture.shape)).astype(np.float32)
+    found = displacement_px(picture, change)
+    assert found == pytest.approx((x_px, y_px), abs=2.0)
+
+
+def test_a_picture_that_is_too_sharp_is_blurred_to_what_moves() -> None:
+    sharp = scene(1.0) / np.float32(4.0)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 3.0)
+    change = np.asarray(moved(soft, 2.5, 0.0) - moved(soft, 1.5, 0.0), np.float32)
+    inside = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+    now = moved(soft, 2.0, 0.0)[inside]
+    assert np.std(laid_on(sharp, change)[inside] - now) < 0.3 * np.std(sharp[inside] - now)
+
+
+def test_without_events_a_picture_is_where_it_was() -> None:
+    assert displacement_px(scene(4.5), np.zeros((SIZE, SIZE), np.float32)) == (0.0, 0.0)
+    noise = np.random.default_rng(2).integers(-1, 2, size=(SIZE, SIZE)).astype(np.float32)
+    assert np.hypot(*displacement_px(scene(4.5), noise)) < 5.0
+
+
+def rested(events: EventArrays, *frames: Frame, picture: NDArray[np.float32] | None = None) -> Resting:
+    resting = Resting(ROI, GEOMETRY, None if picture is None else lambda: picture)
     resting.add(*events, None)
     resting.see(frames)
     resting.settle(np.zeros((SIZE, SIZE), np.int16))
@@ -147,10 +210,22 @@ def test_what_was_seen_since_a_frame_is_built_upon_it() -> None:
     when = SensorUs(int(events.t[300]))
     start = rested(events, Frame(when, when, 0, pixels)).image_at_start
     assert start is not None
-    assert start.pictured
     assert start.events == 400
     since = EventArrays(events.t[300:], events.x[300:], events.y[300:], events.p[300:])
     np.testing.assert_allclose(start.levels, levels_of(since, frame_levels(pixels)), atol=1e-4)
+
+
+def test_a_sensor_without_frames_builds_beside_its_first_picture() -> None:
+    events = events_at(4, 700, (scene(3.0) > 0).astype(np.uint8))
+    picture = scene(4.5, seed=8)
+    resting = rested(events, picture=picture)
+    assert resting.image_at_start is not None
+    np.testing.assert_array_equal(resting.image_at_start.levels, levels_of(events))
+    assert resting.beneath is not None
+    assert resting.unrest is not None
+    alone = rested(events)
+    assert alone.beneath is None
+    assert alone.unrest is None  # nothing shows a direction but the product
 
 
 def test_a_region_that_goes_with_its_scene_sees_the_same_sharpness() -> None:

@@ -154,3 +154,13 @@ def test_the_command_answers_people_and_programs(monkeypatch: pytest.MonkeyPatch
     assert answer["self_test"][0]["outcome"] == "FOCUSED"
     broken = next(item for item in answer["drivers"] if item["driver"] == "strange_broken")
     assert broken["error"] == "RuntimeError: firmware of another century"
+
+
+def test_what_is_to_be_typed_is_printed_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    line = "echo '" + ", ".join(f'ATTRS{{word{k}}}=="{k}"' for k in range(12)) + "' | sudo tee /etc/a.rules"
+    step = f"{'no permission to open it ' * 8}: type this:\n{line}"
+    check.tell([Finding("devices", "camera", Status.PROBLEM, "/dev/x", step)])
+    told = capsys.readouterr().out.splitlines()
+    assert told[-1].strip() == line
+    assert len(told) > 5
+    assert all(len(one) <= 120 for one in told[:-1])

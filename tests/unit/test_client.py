@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from sockets import press_ctrl_c, serving
 
-from elpd.client import AsyncClient, Client, socket_path
-from elpd.client.wire import SYSTEM_SOCKET
+from elpd.client import AsyncClient, Client, socket_path, wire
 from elpd.errors import BusyError, UnreachableError, UsageError
 from elpd.service.messages import FaultEvent, PhaseEvent, SampleEvent, StateEvent
 
@@ -60,8 +59,14 @@ def test_the_client_needs_nothing_but_the_standard_library() -> None:
 def test_the_socket_is_looked_for_where_a_daemon_would_be(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("ELPD_SOCKET", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    if not SYSTEM_SOCKET.exists():
-        assert socket_path() == tmp_path / "elpd" / "elpd.sock"
+    monkeypatch.setattr(wire, "SYSTEM_SOCKET", Path("/proc/none/elpd/elpd.sock"))
+    assert socket_path() == tmp_path / "elpd" / "elpd.sock"
+    (tmp_path / "run").mkdir()
+    monkeypatch.setattr(wire, "SYSTEM_SOCKET", tmp_path / "run" / "elpd" / "elpd.sock")
+    assert socket_path() == tmp_path / "run" / "elpd" / "elpd.sock"  # no daemon yet; this user's would be there
+    (tmp_path / "elpd").mkdir()
+    (tmp_path / "elpd" / "elpd.sock").touch()
+    assert socket_path() == tmp_path / "elpd" / "elpd.sock"
     monkeypatch.setenv("ELPD_SOCKET", "/from/the/environment")
     assert socket_path() == Path("/from/the/environment")
     assert socket_path("/given") == Path("/given")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -11,7 +12,19 @@ import pytest
 from command_line import Answer, caller
 from sockets import press_ctrl_c, serving
 
-from elpd.service.messages import Fault, Holder, LeaseAnswer, PhaseEvent, SampleEvent, Warned
+from elpd.service.messages import (
+    Fault,
+    Holder,
+    LeaseAnswer,
+    MapAnswer,
+    PhaseEvent,
+    RunAnswer,
+    RunsAnswer,
+    RunSummary,
+    SampleEvent,
+    TemperatureAnswer,
+    Warned,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -171,6 +184,76 @@ def test_small_commands(elpd: Callable[..., Answer], engine: FakeEngine) -> None
     assert elpd("preset", "save").code == 2
     assert elpd("roi", "--delete").code == 2
     assert elpd("roi", "--name", "left").code == 2
+
+
+RUN = {"outcome": "FOCUSED", "reason": "by pairs", "focus_um": 812.5, "sigma_um": 0.4, "duration_ms": 103.2}
+
+
+def test_runs_are_listed_and_told(elpd: Callable[..., Answer], engine: FakeEngine) -> None:
+    one = RunSummary(name="20260101T000000Z-001", at="2026-01-01T00:00:00Z", kept=False, **RUN)
+    two = RunSummary.model_validate(dict.fromkeys(RUN) | {"name": "mine", "at": None, "kept": True})
+    engine.answers["runs"] = RunsAnswer(runs=[one, two])
+    assert [line.split() for line in elpd("runs", "--limit", "2").out.splitlines()] == [
+        ["20260101T000000Z-001", "FOCUSED", "812.50", "um", "sigma", "0.40", "103", "ms"],
+        ["mine", "ERROR", "kept"],
+    ]
+    assert engine.requests[-1].params.model_dump() == {"limit": 2}
+    assert [run["name"] for run in elpd("runs", "--json").json["runs"]] == ["20260101T000000Z-001", "mine"]
+    result = RUN | {"warnings": ["hot pixels"]}
+    engine.answers["run"] = RunAnswer(name="mine", result=result, samples=[(1.0, 2, 3.0, 4)], config={}, files=["a"])
+    told = dict(line.split(maxsplit=1) for line in elpd("runs", "mine").out.splitlines())
+    assert (told["outcome"], told["focus"], told["warning"]) == ("FOCUSED: by pairs", "812.5 um", "hot pixels")
+    assert elpd("runs", "mine", "--json").json["samples"] == [[1.0, 2, 3.0, 4]]
+
+
+def test_without_a_daemon_runs_are_read_from_their_folder(
+    elpd: Callable[..., Answer], path: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "runs" / "20260101T000000Z-001"
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text(json.dumps({"result": RUN, "config": {}, "format": 1, "elpd": "0", "request": {}}))
+    answer = elpd("runs", "--set", f"journal.directory={tmp_path / 'runs'}", "--json")
+    assert (answer.code, answer.json["runs"][0]["focus_um"]) == (0, 812.5)
+    assert "no daemon answers; from" in answer.err
+    one = elpd("runs", "20260101T000000Z-001", "--set", f"journal.directory={tmp_path / 'runs'}", "--json")
+    assert one.json["result"] == RUN
+    assert elpd("runs", "nothing", "--set", f"journal.directory={tmp_path / 'runs'}").code == 2
+    assert elpd("runs", "--set", f"journal.directory={tmp_path / 'none'}").out == "no runs yet; every cycle makes one\n"
+    assert elpd("runs", "--socket", str(path), "--json").json["error"]["kind"] == "UnreachableError"
+
+
+def test_the_picture_is_written_as_its_name_says(
+    elpd: Callable[..., Answer], engine: FakeEngine, tmp_path: Path
+) -> None:
+    engine.answers["map"] = MapAnswer(
+        kind="map", format="png16", width=4, height=2, sensor={"width": 4, "height": 2}, image="UE5H", age_s=1.25,
+        position_um=812.5,
+    )  # fmt: skip
+    answer = elpd("map", "map.png", "--deep", "--kind", "map", "--json")
+    assert (tmp_path / "map.png").read_bytes() == b"PNG"
+    assert (answer.json["out"], answer.json["bytes"], answer.json["age_s"]) == ("map.png", 3, 1.25)
+    assert "image" not in answer.json
+    assert engine.requests[-1].params.model_dump() == {"kind": "map", "format": "png16", "max_width": None}
+    assert elpd("map").out == "map, 4x2, 1.2 s old, lens at 812.50 um\n"
+    assert elpd("map", "map.tiff").code == elpd("map", "map.jpg", "--deep").code == 2
+
+
+def test_metrics_and_temperatures(elpd: Callable[..., Answer], engine: FakeEngine) -> None:
+    assert elpd("metrics").out == "elpd_up 1\n"
+    assert elpd("metrics", "--json").json == {"text": "elpd_up 1\n"}
+    engine.answers["temperature"] = TemperatureAnswer(celsius=-5.0, offset_um=1.5)
+    assert "moved by +1.50 um" in elpd("temperature", "-5").out
+    assert engine.requests[-1].params.model_dump() == {"celsius": -5.0}
+    engine.answers["temperature"] = TemperatureAnswer(celsius=20.0, offset_um=None)
+    assert "nothing follows" in elpd("temperature", "20").out
+    assert elpd("temperature", "20", "--json").json == {"celsius": 20.0, "offset_um": None}
+    assert elpd("temperature", "warm").code == elpd("temperature", "1000").code == 2
+
+
+def test_nobody_answers_any_of_them(elpd: Callable[..., Answer], path: Path) -> None:
+    for command in (["map"], ["metrics"], ["temperature", "20"]):
+        answer = elpd(*command, "--json")
+        assert (answer.code, answer.json["error"]["kind"]) == (4, "UnreachableError")
 
 
 def test_the_daemon_of_a_configuration_is_found(elpd: Callable[..., Answer], engine: FakeEngine, path: Path) -> None:

@@ -3,64 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from davis_stand_in import EPOCH_US, dv, source, store
 from elpd_drivers.cameras import davis
-from elpd_drivers.cameras.davis import DavisSettings, DavisSource
 from virtual import MonotonicClock
 
 from elpd.errors import CameraError, ConfigError
 from elpd.events.layout import event_columns
 from elpd.records import Encoding, Geometry
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-dv = pytest.importorskip("dv_processing")
-
-EPOCH_US = 1_795_388_665_467_217
-
-
-class Camera:
-    """Whatever is set is noted; whatever is asked for next is what the test put there."""
-
-    def __init__(self) -> None:
-        self.said: dict[str, Any] = {}
-        self.batches: dict[str, deque[Any]] = {name: deque() for name in ("Event", "Frame", "Imu", "Trigger")}
-        self.running = True
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("set"):
-            return lambda *values: self.said.update({name.removeprefix("set"): values})
-        kind = name.removeprefix("getNext").removesuffix("Batch")
-        if kind in self.batches:
-            return lambda: self.batches[kind].popleft() if self.batches[kind] else None
-        answers = {
-            "isRunning": lambda: self.running,
-            "getEventResolution": lambda: (346, 260),
-            "getCameraName": lambda: "DAVIS346_00000499",
-            "getSerialNumber": lambda: "00000499",
-            "getDavis346BiasCoarseFine": lambda _: (4, 39),
-        }
-        if name not in answers:
-            raise AttributeError(name)
-        return answers[name]
-
-
-def source(**settings: Any) -> tuple[DavisSource, Camera]:
-    camera = Camera()
-    return DavisSource(camera, dv, DavisSettings.model_validate(settings)), camera
-
-
-def store(events: Sequence[tuple[int, int, int, bool]]) -> Any:
-    made = dv.EventStore()
-    for event in events:
-        made.push_back(*event)
-    return made
 
 
 def test_the_store_that_the_library_makes_is_the_one_we_know() -> None:
@@ -162,13 +115,24 @@ def test_the_settings_reach_the_camera() -> None:
 
 
 def test_every_method_that_is_called_is_the_library_s_own() -> None:
-    """The camera above agrees to anything; the real class must know each name."""
-    opened, camera = source(exposure_us=700)
-    opened.call("set_window", [None])
-    for name in camera.said:
-        assert hasattr(dv.io.camera.DAVIS, f"set{name}"), name
+    """The stand-in takes only what the real class can be told; what it answers the real one must know, too."""
     for name in ("isRunning", "getEventResolution", "getCameraName", "getSerialNumber", "getNextImuBatch"):
         assert hasattr(dv.io.camera.DAVIS, name), name
+
+
+@pytest.mark.parametrize(
+    ("model", "abilities"), [("DVXplorer", ("window", "trigger", "imu")), ("DVXplorerM", ("window", "imu"))]
+)
+def test_cameras_without_frames_are_told_what_they_know(model: str, abilities: tuple[str, ...]) -> None:
+    opened, camera = source(getattr(dv.io.camera, model))
+    assert opened.facts.abilities == abilities
+    opened.call("set_window", [[10, 20, 30, 40]])
+    assert camera.said["CropArea"] == ((10, 20, 30, 40),)
+    assert ("DetectorRunning" in camera.said) == ("trigger" in abilities)
+    with pytest.raises(ConfigError, match=r"camera\.biases: this camera's biases cannot be set one by one"):
+        source(getattr(dv.io.camera, model), biases={"focus": {"On": (1, 2)}})
+    opened.close()
+    opened.close()
 
 
 def test_an_unplugged_camera_is_an_error() -> None:
@@ -178,6 +142,15 @@ def test_an_unplugged_camera_is_an_error() -> None:
         opened.read(0.0)
     opened.close()
     opened.close()
+
+
+def test_a_clock_that_was_set_back_is_another_epoch() -> None:
+    opened, camera = source()
+    camera.batches["Event"] += [store([(EPOCH_US + at, 1, 2, True)]) for at in (5_000_000, 4_500_000, 3_900_000)]
+    for _ in range(2):
+        assert opened.read(0.0) is not None, "streams are handed out out of step"
+    with pytest.raises(CameraError, match=r"its clock jumped back by 1\.100 s; it was reset, start again"):
+        opened.read(0.0)
 
 
 def test_wrong_tables_say_so() -> None:

@@ -55,6 +55,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     open_to_us: set[str] = set()
     monkeypatch.setattr(discovery.os, "access", lambda node, _: str(node) in open_to_us)
     monkeypatch.setattr(discovery, "_holder", lambda _: None)
+    monkeypatch.setattr(discovery, "INSTALLED_RULES", Path("/nowhere"))
     return open_to_us
 
 
@@ -80,8 +81,23 @@ def test_a_node_that_is_closed_to_us_gives_the_udev_rule(nodes: set[str], monkey
         (found,) = discovery.usb_cameras(Libusb([device]))
         assert found.next_step is not None
         assert "no permission to open /dev/bus/usb/999/" in found.next_step
-        assert "/etc/udev/rules.d/70-elpd.rules" in found.next_step
-        assert UDEV_RULES[device[0]] in found.next_step
+        told, line = found.next_step.splitlines()
+        assert told.endswith("type this, then plug it in again:")
+        assert line == f"echo '{UDEV_RULES[device[0]]}' | sudo tee /etc/udev/rules.d/71-elpd-camera.rules"
+
+
+def test_where_the_rules_are_installed_the_group_is_what_is_missing(
+    nodes: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another rule would take the camera from the daemon's group."""
+    assert not nodes
+    installed(monkeypatch, "neuromorphic_drivers")
+    (tmp_path / "70-elpd.rules").touch()
+    monkeypatch.setattr(discovery, "INSTALLED_RULES", tmp_path / "70-elpd.rules")
+    (found,) = discovery.usb_cameras(Libusb([EVK4]))
+    assert found.next_step is not None
+    assert "add yourself to its group" in found.next_step
+    assert "udev" not in found.next_step
 
 
 def test_a_camera_without_a_driver_gives_the_line_that_installs_one(
@@ -93,6 +109,15 @@ def test_a_camera_without_a_driver_gives_the_line_that_installs_one(
     assert found.next_step == (
         "no driver for it is installed: pip install 'elpd[neuromorphic]' or install OpenEB or the Metavision SDK"
     )
+
+
+def test_all_that_is_in_the_way_is_told_at_once(nodes: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not nodes
+    installed(monkeypatch)
+    (found,) = discovery.usb_cameras(Libusb([DAVIS]))
+    assert found.next_step is not None
+    assert "pip install 'elpd[davis]' or pip install 'elpd[neuromorphic]'" in found.next_step
+    assert "no permission" in found.next_step
 
 
 def test_a_camera_that_another_program_holds_names_it(nodes: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,8 +132,16 @@ def test_who_holds_a_node_is_read_from_the_open_files(tmp_path: Path) -> None:
         (tmp_path / pid / "fd").mkdir(parents=True)
         (tmp_path / pid / "fd" / "5").symlink_to(target)
         (tmp_path / pid / "comm").write_text("viewer\n")
+        (tmp_path / pid / "cmdline").write_bytes(b"/usr/bin/viewer\0--full")
     (tmp_path / "99").mkdir()
     assert discovery._holder(Path("/dev/bus/usb/002/003"), tmp_path) == "viewer (process 42)"
+    for words in (
+        "python3 -m elpd_drivers.cameras.capture_child 5",
+        "python3 /opt/bin/elpd serve",
+        "python3 -m elpd serve",
+    ):
+        (tmp_path / "42" / "cmdline").write_bytes("\0".join(words.split()).encode())
+        assert discovery._holder(Path("/dev/bus/usb/002/003"), tmp_path) is None, "elpd is in nobody's way"
     assert discovery._holder(Path("/dev/ttyUSB0"), tmp_path) is None, "our own open files are not in our way"
     assert discovery._holder(Path("/dev/ttyUSB1"), tmp_path) is None
 
@@ -159,9 +192,10 @@ def test_serial_ports_are_looked_for_without_being_opened(tmp_path: Path, monkey
 @pytest.mark.parametrize(
     ("said", "meant"),
     [
-        ("Access denied (insufficient permissions)", "put the udev rule"),
+        ("Access denied (insufficient permissions)", "prints the udev rule"),
         ("Failed to open USB device. This usually happens due to permissions or driver issues", "udev rule"),
         ("Resource busy", "another program holds it"),
+        ("the device is already used by another program", "another program holds it"),
         ("PropheseeEvk4(Usb(Rusb(NoDevice)))", "unplugged (no device)"),
         ("no device found", "none found"),
         ("PropheseeEvk4(Usb(Rusb(Pipe)))", "stalled"),

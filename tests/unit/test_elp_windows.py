@@ -12,7 +12,7 @@ from streams import cuts, evt2_words, evt3_stream, evt3_words, evt21_words, long
 
 from elpd.errors import UsageError
 from elpd.events.evt3_encode import Evt3Encoder
-from elpd.events.evt3_lanes import LISTS
+from elpd.events.evt3_lists import LISTS
 from elpd.events.registers import new_state
 from elpd.records import CameraPacket, Encoding
 from elpd.vision import elp_lanes, elp_words

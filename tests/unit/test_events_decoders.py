@@ -14,8 +14,8 @@ from elpd.events import evt2, evt3
 from elpd.events.evt2 import Evt2Decoder, Evt21Decoder, swap_halves
 from elpd.events.evt3 import Evt3Decoder
 from elpd.events.evt3_fast import Evt3BlockDecoder
-from elpd.events.lanes import available
 from elpd.events.registers import new_state, new_triggers
+from elpd.events.simd import available
 from elpd.records import Geometry, Trigger
 
 CODECS = {

@@ -4,7 +4,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from elpd_drivers.formats.csv_text import FORMAT
 from event_files import GEOMETRY, event_columns, many, peak_bytes, read_all, write_all
@@ -123,13 +122,3 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
             assert sum(len(one.data) for one in reader.packets(1 << 12)) == 12_000
 
     assert peak_bytes(there_and_back) < 600_000
-
-
-def test_faery_reads_what_we_write(tmp_path: Path) -> None:
-    faery = pytest.importorskip("faery")
-    path = tmp_path / "r.csv"
-    columns = many(2000)
-    write_all(FORMAT.create(path, "csv", GEOMETRY, {}), [column.tolist() for column in columns])
-    theirs = np.concatenate(list(faery.events_stream_from_file(path, dimensions_fallback=(64, 48))))
-    for ours, name in zip(columns, ("t", "x", "y", "on"), strict=True):
-        assert (ours == theirs[name]).all()

@@ -128,20 +128,6 @@ def test_no_payload_makes_the_reader_fail(
     assert all(value < 240 for value in y)
 
 
-@pytest.mark.parametrize("peer", ["expelliarmus", "faery"])
-def test_other_peoples_readers_agree(tmp_path: Path, peer: str) -> None:
-    module = pytest.importorskip(peer)
-    path = tmp_path / "r.dat"
-    columns = many(20_000)
-    write_all(FORMAT.create(path, "dat", GEOMETRY, {"date": "2026-01-01 00:00:00"}), [c.tolist() for c in columns])
-    if peer == "expelliarmus":
-        theirs = module.Wizard(encoding="dat").read(path)
-    else:
-        theirs = np.concatenate(list(module.events_stream_from_file(path)))
-    for ours, name in zip(columns, ("t", "x", "y", "p" if peer == "expelliarmus" else "on"), strict=True):
-        assert (ours == theirs[name]).all()
-
-
 def test_what_other_people_write_is_read(tmp_path: Path) -> None:
     faery = pytest.importorskip("faery")
     path = tmp_path / "r.dat"

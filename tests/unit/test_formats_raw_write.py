@@ -148,31 +148,3 @@ def test_a_sensor_of_too_many_columns_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="11-bit addresses"):
         FORMAT.create(tmp_path / "r.raw", "evt3", Geometry(2049, 10), {})
     assert isinstance(FORMAT, WritableFormat)
-
-
-@pytest.mark.parametrize("word", ["evt3", "evt2"])
-def test_other_peoples_decoders_read_what_we_write(tmp_path: Path, word: str) -> None:
-    peer = pytest.importorskip({"evt3": "evt3", "evt2": "expelliarmus"}[word])
-    size = Geometry(1280, 720)
-    path = tmp_path / "r.raw"
-    columns = many(20_000, geometry=size, step_us=3)
-    write_all(FORMAT.create(path, word, size, {}), [column.tolist() for column in columns], [7000])
-    if word == "evt3":
-        found = peer.decode_file(str(path))
-        theirs = [np.asarray(getattr(found, name)) for name in "txyp"]
-    else:
-        array = peer.Wizard(encoding="evt2").read(path)
-        theirs = [array[name] for name in "txyp"]
-    for ours, other in zip(columns, theirs, strict=True):
-        assert (ours == other).all()
-
-
-@pytest.mark.parametrize("word", ["evt3", "evt2"])
-def test_faery_reads_what_we_write(tmp_path: Path, word: str) -> None:
-    faery = pytest.importorskip("faery")
-    path = tmp_path / "r.raw"
-    columns = many(5000)
-    write_all(FORMAT.create(path, word, GEOMETRY, {}), [column.tolist() for column in columns])
-    found = np.concatenate(list(faery.events_stream_from_file(path)))
-    for ours, name in zip(columns, ("t", "x", "y", "on"), strict=True):
-        assert (ours == found[name]).all()

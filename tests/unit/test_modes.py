@@ -52,6 +52,18 @@ def test_between_the_two_levels_the_decision_of_before_holds() -> None:
     assert not decide(replace(WATCHING, loss=FOUND_AGAIN - 0.01, defocused=True), PATIENCE).defocused
 
 
+def test_what_is_never_heard_is_checked_again_in_time() -> None:
+    patient = replace(PATIENCE, recheck_s=300.0)
+    waiting = decide(replace(WATCHING, now_s=299.0), patient)
+    assert (waiting.focus, waiting.waits_for, waiting.left_s) == (False, "a loss of sharpness", 1.0)
+    due = replace(WATCHING, now_s=300.0)
+    assert decide(due, patient).focus
+    assert not decide(due, PATIENCE).focus
+    assert not decide(replace(due, quiet_s=0.0), patient).focus, "not while the scene moves"
+    assert decide(replace(due, loss=None, quiet_s=0.0), patient).focus, "where nothing is weighed nothing is waited for"
+    assert not decide(replace(due, loss=None, blocked="the end of a lease"), patient).focus
+
+
 def test_a_schedule_keeps_its_time_and_nothing_else() -> None:
     view = replace(WATCHING, mode="scheduled", loss=None, now_s=599.0)
     waiting = decide(view, PATIENCE)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import json
 import math
 import threading
 from pathlib import Path
@@ -343,6 +344,19 @@ def test_what_an_ability_answered_is_answered_again(player: Player, tmp_path: Pa
     reader = player(tmp_path)
     assert same(use(replay_rig(reader)), answer)
     assert reader.remaining() == 0
+
+
+def test_a_tape_from_before_these_abilities_were_on_it_is_read(player: Player, tmp_path: Path) -> None:
+    tape, parts = recorded(tmp_path, [7])
+    parts.clock.now_ns()
+    tape.close()
+    path = tmp_path / "tape.jsonl"
+    head, *calls = path.read_text().splitlines(keepends=True)
+    facts = json.loads(head)
+    for name in ("serials", "outputs", "mark_channel", "steps_to_um"):
+        del facts["facts"][name]
+    path.write_text("".join([json.dumps(facts) + "\n", *calls]))
+    assert replay_rig(player(tmp_path)).clock.now_ns() == 7
 
 
 class StrangeError(LensError):

@@ -90,6 +90,8 @@ class Day:
         self.directory = directory
         self.ledger = Ledger(DEPTH_OF_FOCUS_UM)
         self.waiting: dict[int, str] = {}
+        self.enough = False
+        """Set to end ``run`` early."""
         self.elapsed_s = 0.0
         self.celsius = MILD_C
         self.afterwards: Callable[[], object] | None = None
@@ -151,7 +153,7 @@ class Day:
         """Let so many hours pass, and more until there were so many cycles."""
         memory.drop_compiler()  # as the daemon does
         end_s, weighed_s = self.elapsed_s + 3600.0 * hours, self.elapsed_s
-        while self.elapsed_s < end_s or self.ledger.outcomes.total() < cycles:
+        while not self.enough and (self.elapsed_s < end_s or self.ledger.outcomes.total() < cycles):
             try:
                 self._turn()
             except KilledError:
@@ -175,7 +177,10 @@ class Day:
     # --- one turn ---
 
     def _turn(self) -> None:
+        before = self.ledger.outcomes.total()
         self.engine.step()
+        if self.ledger.outcomes.total() != before:
+            memory.give_back()  # as the daemon does
         self.elapsed_s = self.time.now_s()
         self._check()
         self._knock()

@@ -44,6 +44,8 @@ class Hour:
     """An hour, or as long as it is run. What is asked follows from the seed; what comes back, from the machine."""
 
     def __init__(self, path: Path, seed: int) -> None:
+        self.enough = False
+        """Set to end ``run`` early."""
         self._path = path
         self._chance = np.random.default_rng(seed)
         self._ledger = Ledger(DEPTH_OF_FOCUS_UM)
@@ -52,7 +54,7 @@ class Hour:
         self._end = threading.Event()
         self._focus_um: float | None = None
         self._process = _server(path)
-        self._cpu_s = _cpu_s(self._process)
+        self._used_s = processor_s(self._process)
         self._begun_s = time.monotonic()
         self._elapsed_s = 0.0
         self._last: dict[str, Any] = {}
@@ -72,7 +74,7 @@ class Hour:
             thread.start()
         weighed_s = float("-inf")
         with Client(self._path, timeout_s=PATIENCE_S) as rig, Client(self._path, timeout_s=PATIENCE_S) as other:
-            while self._elapsed_s < 3600.0 * hours:
+            while not self.enough and self._elapsed_s < 3600.0 * hours:
                 self._elapsed_s = time.monotonic() - self._begun_s
                 if self._elapsed_s - weighed_s >= WEIGHED_EVERY_S:
                     weighed_s = self._elapsed_s
@@ -87,7 +89,7 @@ class Hour:
 
     def figures(self) -> dict[str, Any]:
         """Return what came of it."""
-        cpu_s = _cpu_s(self._process) - self._cpu_s
+        cpu_s = processor_s(self._process) - self._used_s
         return {
             "hours": round(self._elapsed_s / 3600, 2),
             **self._ledger.figures(),
@@ -168,7 +170,7 @@ class Hour:
 
     def _weigh(self) -> None:
         row = self._ledger.weigh(self._elapsed_s / 3600, self._process)
-        row["cpu_s"] = round(_cpu_s(self._process) - self._cpu_s, 1)
+        row["cpu_s"] = round(processor_s(self._process) - self._used_s, 1)
         print(f"{row}  {dict(self._ledger.outcomes)}", file=sys.stderr, flush=True)
 
     # --- the nuisances, each in a thread of its own ---
@@ -218,7 +220,7 @@ def _server(path: Path) -> int:
     return process
 
 
-def _cpu_s(process: int) -> float:
+def processor_s(process: int) -> float:
     """Return how much processor time a process has used."""
     fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -9,7 +9,7 @@ import numpy as np
 from elpd.events.evt2_encode import Evt2Encoder, Evt21Encoder
 from elpd.events.evt3 import Evt3Decoder
 from elpd.events.evt3_fast import Evt3BlockDecoder
-from elpd.events.lanes import available
+from elpd.events.simd import available
 from elpd.records import CameraPacket, Encoding
 from elpd.units import HostNs
 from elpd.vision import elp_words

@@ -43,6 +43,9 @@ EVENTS = np.dtype({
 READ_OUT_US = 9_200
 """From the end of an exposure to the end of its read-out, in a recording of a DAVIS346 (the library does not say)."""
 
+CLOCK_JUMP_US = US_PER_S
+"""Nothing on the way from the sensor's streams to here takes a second; a sensor that was reset does."""
+
 TURN_S = 0.0003
 """The library's streams can only be asked, not waited for; this is a third of the shortest commit interval."""
 
@@ -110,6 +113,7 @@ class DavisSource:
     def __init__(self, camera: Any, dv: Any, table: DavisSettings) -> None:
         self._camera, self._dv, self._table = camera, dv, table
         self._is_davis = hasattr(camera, "setCropAreaEvents")
+        self._has_detector = hasattr(camera, "setDetectorRunning")  # a DVXplorer Micro has no trigger input
         self._origin_us: int | None = None
         self._newest_us = 0
         self._frames = 0
@@ -123,7 +127,7 @@ class DavisSource:
             serial=str(camera.getSerialNumber()),
             min_latency_us=table.interval_us if table.min_latency_us is None else table.min_latency_us,
             layout=layout_of(EVENTS),
-            abilities=("window", *(("biases",) if self._is_davis else ()), "trigger", "imu"),
+            abilities=tuple(self._abilities()),
         )
 
     def read(self, timeout_s: float) -> Captured | None:
@@ -159,7 +163,7 @@ class DavisSource:
 
     def close(self) -> None:
         """Stop the streams; the library closes the camera when it is forgotten. Idempotent."""
-        if self._camera is not None and self._camera.isRunning():
+        if hasattr(self._camera, "setEventsRunning") and self._camera.isRunning():
             self._camera.setEventsRunning(False)
         self._camera = None
 
@@ -168,13 +172,15 @@ class DavisSource:
     def _configure(self) -> None:
         camera, table = self._camera, self._table
         camera.setTimeInterval(timedelta(microseconds=table.interval_us))
-        camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
+        if hasattr(camera, "setUSBEarlyPacketDelay"):
+            camera.setUSBEarlyPacketDelay(timedelta(microseconds=table.interval_us))
         camera.setImuRunningAccelerometer(True)  # delivered or not, it keeps time in the dark
         camera.setImuRunningGyroscope(True)
         camera.setImuRunningTemperature(True)
-        camera.setDetectorRisingEdges(True)
-        camera.setDetectorFallingEdges(True)
-        camera.setDetectorRunning(table.trigger)
+        if self._has_detector:
+            camera.setDetectorRisingEdges(True)
+            camera.setDetectorFallingEdges(True)
+            camera.setDetectorRunning(table.trigger)
         if not self._is_davis:
             if table.biases != BiasTables():
                 raise ConfigError("camera.biases: this camera's biases cannot be set one by one; remove the table")
@@ -187,6 +193,10 @@ class DavisSource:
             camera.setExposureDuration(timedelta(microseconds=table.exposure_us))
         self._normal = {name: camera.getDavis346BiasCoarseFine(self._bias(name)) for name in self._named()}
         self._set_biases(table.biases.focus)
+
+    def _abilities(self) -> list[str]:
+        has = {"window": True, "biases": self._is_davis, "trigger": self._has_detector, "imu": True}
+        return [name for name, there in has.items() if there]
 
     def _named(self) -> set[str]:
         return {*self._table.biases.expose, *self._table.biases.focus}
@@ -225,6 +235,7 @@ class DavisSource:
         if self._origin_us is None and stamps:
             self._origin_us = min(stamps) - US_PER_S
         origin_us = self._origin_us or 0
+        self._watch_clock(stamps)
         self._newest_us = max([self._newest_us, *(stamp - origin_us for stamp in stamps)])
         self._frames += frame is not None
         return Captured(
@@ -236,6 +247,12 @@ class DavisSource:
             triggers=() if edges is None else tuple(self._edges(edges, origin_us)),
             imu=tuple(_samples(motion, origin_us)) if motion and self._with_imu else (),
         )
+
+    def _watch_clock(self, stamps: Sequence[int]) -> None:
+        """Raise ``CameraError`` if the camera's clock was set back: streams are out of step, but not by a second."""
+        back_us = self._newest_us - (max(stamps, default=0) - (self._origin_us or 0))
+        if stamps and back_us > CLOCK_JUMP_US:
+            raise CameraError(f"camera: its clock jumped back by {back_us / US_PER_S:.3f} s; it was reset, start again")
 
     def _array(self, events: Any, origin_us: int) -> np.ndarray[Any, np.dtype[Any]]:
         """Copy the library's events, which are a view of its own memory, counted from our origin."""

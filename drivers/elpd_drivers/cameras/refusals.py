@@ -6,7 +6,9 @@ there is one thing a person can do.
 
 from __future__ import annotations
 
-UDEV_FILE = "/etc/udev/rules.d/70-elpd.rules"
+UDEV_FILE = "/etc/udev/rules.d/71-elpd-camera.rules"
+"""Beside the rules of a whole installation, and before those that read the tag "uaccess"."""
+
 UDEV_RULES = {
     0x04B4: 'SUBSYSTEM=="usb", ATTRS{idVendor}=="04b4", ATTRS{idProduct}=="00f[45]", GROUP="video", TAG+="uaccess"',
     0x31F7: 'SUBSYSTEM=="usb", ATTRS{idVendor}=="31f7", ATTRS{idProduct}=="000[34]", GROUP="video", TAG+="uaccess"',
@@ -18,9 +20,12 @@ UDEV_RULES = {
 _MEANINGS = (
     (
         ("access", "permission", "insufficient"),
-        f"no permission to open it; put the udev rule that `elpd check` prints into {UDEV_FILE} and plug it in again",
+        "no permission to open it; `elpd check` prints the udev rule that gives it, then plug it in again",
     ),
-    (("busy", "already open", "in use"), "another program holds it; close that one first"),
+    (
+        ("busy", "already open", "already used", "in use"),
+        "another program holds it; close that one first, `elpd check` names it",
+    ),
     (
         ("nodevice", "no such device", "disconnected", "not connected"),
         "it was unplugged (no device); plug it in again",
