@@ -76,9 +76,10 @@ LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
 
-LAG_UNEXPLAINED_IN_FOCUS = 0.2
-"""The same where the events have told what the picture is in focus: slowness is then right to a tenth, and a receptor's
-delay of a level that turns is its time constant to another one."""
+LAG_UNEXPLAINED_IN_FOCUS = 0.4
+"""The same where the events have told what the picture is in focus. What an event is worth is known to a quarter, because
+light crosses a region's border, and with it the slowness of dark pixels: one portrait's lag was underrated by four tenths.
+"""
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
