@@ -77,8 +77,8 @@ LAG_UNEXPLAINED = 1.0
 which hides most of the difference."""
 
 LAG_UNEXPLAINED_IN_FOCUS = 0.4
-"""The same where the events have told what the picture is in focus. What an event is worth is known to a quarter, because
-light crosses a region's border, and with it the slowness of dark pixels: one portrait's lag was underrated by four tenths.
+"""The same where the events have told what the picture is in focus. What an event is worth is known to a quarter,
+because light crosses a region's border, and with it the slowness of dark pixels: one lag was underrated by four tenths.
 """
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
