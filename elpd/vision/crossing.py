@@ -25,7 +25,7 @@ from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, weights_of_li
 from elpd.vision.light import in_focus, worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
-from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, counted, hush, rebuilt, rows_of
+from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,6 +45,9 @@ SMOOTH_PAIRS = 0.01
 """How far, in widths of the curve, midpoints of bright pixels' pairs lie from those of dark ones for other reasons than
 lag, as a standard deviation over a picture's brightness: 27 still sweeps through four lenses have 0.007, and 0.010
 where the lens is aberrated most. Surfaces have their own brightness, and lenses their own focus for each size."""
+
+SMOOTH_IN_FOCUS = 0.015
+"""The same where the picture in focus was made of the events whose pairs are asked (8 still sweeps: 0.015)."""
 
 STILL = 0.1
 """Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
@@ -76,9 +79,10 @@ LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
 
-LAG_UNEXPLAINED_IN_FOCUS = 0.2
-"""The same where the events have told what the picture is in focus: slowness is then right to a tenth, and a receptor's
-delay of a level that turns is its time constant to another one."""
+LAG_UNEXPLAINED_IN_FOCUS = 0.4
+"""The same where the events have told what the picture is in focus. What an event is worth is known to a quarter,
+because light crosses a region's border, and with it the slowness of dark pixels: one lag was underrated by four tenths.
+"""
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
@@ -223,7 +227,6 @@ def ask_events(
     dark: float = DARK,
     *,
     hurried: bool = True,
-    lit: bool = False,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
@@ -231,7 +234,7 @@ def ask_events(
     photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
     typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
     *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
-    *hurried* says that a lens waits, *lit* that a lamp's flicker is among the events.
+    *hurried* says that a lens waits.
     *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
     *brightness* does not show, relative to the brightest parts.
     """
@@ -245,7 +248,7 @@ def ask_events(
     worths = WORTHS if worth is None else tuple(one / worth for one in NEAR_WORTHS)
     slownesses = _slownesses(start, at_peak, slowness, worth, events.margin)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
-    smooth = SMOOTH_PAIRS * flank_width(begin, peak)
+    smooth = (SMOOTH_PAIRS if worth is None else SMOOTH_IN_FOCUS) * flank_width(begin, peak)
     pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth)
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
     if planes:
@@ -276,9 +279,6 @@ def ask_events(
         if (one := _image_focus(curve, ticks, peak, count)) is not None
     ]
     image = average_focus(candidates) if candidates else None
-    if lit:
-        plain = _curves(counted(events, ticks), None, (), weight, events.margin)[0]
-        image, pairs = between(image, _image_focus(plain, ticks, peak)), None
     energy, turning = _who_turns(at_peak, bend, weight)
     lags, expected = late.candidates, late.typical
     if energy.any():
@@ -314,20 +314,6 @@ def _typical(slowness: NDArray[np.float64], turning: NDArray[np.float32], energy
     if total <= 0.0:
         return by_energy
     return float(np.clip((slowness * turning).sum() / total, slowness.min(), slowness.max()))
-
-
-def between(mirrored: BandFocus | None, plain: BandFocus | None) -> BandFocus | None:
-    """Return the focus of a scene under a lamp: between that of turns that are mirrored and that of mere counting.
-
-    A pixel that is lit evenly must come back by a threshold and what it had risen beyond its last event before it
-    answers: a mirrored turn makes up for that. One that a lamp of amplitude A swings answers at the lamp's top as long
-    as it rises and at its bottom once it falls, 2·A sooner: by how much nobody knows, from nothing to all of it. So
-    half the difference of the two is the error, and mirror pairs, which are early by A over the slope, are not asked.
-    """
-    if mirrored is None or plain is None:
-        return None
-    apart = 0.5 * (plain.at - mirrored.at)
-    return replace(mirrored, at=mirrored.at + apart, sigma=float(np.hypot(mirrored.sigma, apart)))
 
 
 def _by_brightness(

@@ -246,14 +246,12 @@ class EventMemory:
         dark: float = DARK,
         *,
         hurried: bool = True,
-        lit: bool = False,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
         show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
-        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer,
-        *lit* that a lamp's flicker is among the events.
+        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
         ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
@@ -286,7 +284,6 @@ class EventMemory:
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
             dark,
             hurried=hurried,
-            lit=lit,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -304,7 +301,7 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False, lit=self.flicker() is not None)
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None
