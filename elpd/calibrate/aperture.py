@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 CERTAIN = 3.0
 """Standard errors that an upper bound of the opening time lies above its mean."""
 
-_SIMULATED_APERTURE = ("seed", "aperture_ms", "aperture_profile", "aperture_slow")
+_SIMULATED_APERTURE = ("seed", "aperture_ms", "aperture_profile", "aperture_slow", "iris_steps", "iris_speed_sps")
+_ON_THE_LENS = "iris_"
+"""What the keys of ``[lens]`` begin with that say how an iris on its controller is turned."""
 
 
 class ApertureCalibration(Profile):
@@ -120,7 +122,10 @@ def measured_on(config: Config) -> MeasuredOn:
         settings = {f"sim.{key}": every[key] for key in _SIMULATED_APERTURE if key in every}
     else:
         plain = json.loads(json.dumps(config.aperture.settings(), default=str))
-        settings = {f"aperture.{key}": value for key, value in plain.items()}
+        if config.aperture.driver == "lens-output":
+            every = json.loads(json.dumps(config.lens.settings(), default=str))
+            plain |= {f"lens.{key}": value for key, value in every.items() if key.startswith(_ON_THE_LENS)}
+        settings = {key if "." in key else f"aperture.{key}": value for key, value in plain.items()}
     return MeasuredOn(device=f"aperture {config.aperture.driver}", serial=None, width=0, height=0, settings=settings)
 
 

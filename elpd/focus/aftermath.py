@@ -14,13 +14,15 @@ from elpd.focus.frame_track import FrameTrack
 from elpd.focus.passes import NO_PLAY, Pass, Passes, Play
 from elpd.units import SensorUs
 from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
+from elpd.vision.sharpest import sharpest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.focus.hearing import Hearing
-    from elpd.records import CameraPacket, ElpSample, FocusEstimate
+    from elpd.records import CameraPacket, FocusEstimate
     from elpd.vision.flicker import Flicker
+    from elpd.vision.sharpest import Sharpest
 
 LOOK_BACK_DOF = 12.0
 """Losses this far back from the decision count against it: the witnesses look no further."""
@@ -83,11 +85,6 @@ class Aftermath:
         return self._hearing.resting.moves or self._passes.scene_moves
 
     @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of the last pass in the sweep's direction, so far."""
-        return tuple(self._outward.samples)
-
-    @property
     def flicker(self) -> Flicker | None:
         """A lamp's flicker that only the sweep has shown."""
         return self._passes.flicker
@@ -114,6 +111,11 @@ class Aftermath:
         """Where the image was sharpest, in the last pass."""
         track = self._hearing.memory.track
         return self._course.leg.sign * track.positions[track.peak]
+
+    def sharpest(self, focus_um: float, distance_um: float) -> Sharpest | None:
+        """Return the picture in focus as the last pass saw it; ``None`` if it saw less than *distance_um* around it."""
+        position = self._course.leg.sign * focus_um
+        return sharpest(self._hearing.memory, self._hearing.roi, position, distance_um)
 
     @property
     def roughly_um(self) -> float:

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from elpd.ports import RigParts, RunSink
     from elpd.records import ElpSample, TemporalImage
     from elpd.vision.reference import Reference
+    from elpd.vision.sharpest import Sharpest
 
 BIAS_SETTLE_MS = 10.0
 """After new biases or a new window a sensor needs a few ms before its events mean anything."""
@@ -117,15 +118,11 @@ class FocusCycle:
         self._warnings: list[str] = []
         self._scene = Scene(self._stage, request, settings, sink, self._phase)
 
-    @property
-    def reference(self) -> Reference | None:
-        """The weights that the region is judged by; ``None`` if it was never chosen."""
-        return None if self._watch is None else self._watch.reference
-
-    @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of the last direction of travel, to its end."""
-        return () if self._watch is None else self._watch.passage
+    def sharpest(self, depths: float) -> Sharpest | None:
+        """Return the picture in focus and what it loses over so many depths of focus; ``None`` if it was not seen."""
+        if self._watch is None or self._estimate is None:
+            return None
+        return self._watch.after.sharpest(self._estimate.focus_um, depths * self._settings.depth_of_focus_um)
 
     def run(self) -> FocusResult:
         """Run the cycle to its one result.

@@ -238,11 +238,6 @@ class Watch:
         return self._after
 
     @property
-    def passage(self) -> tuple[ElpSample, ...]:
-        """The windows of the last pass in the sweep's direction so far."""
-        return () if self._after is None else self._after.passage
-
-    @property
     def depths_um(self) -> tuple[float, ...]:
         """Where planes of the region are in focus, if the estimate has found several, the first met first."""
         return () if self._after is None else self._after.depths_um

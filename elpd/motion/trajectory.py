@@ -1,17 +1,17 @@
 """Where the motor was at any instant: commanded motion, corrected by what the controller reported.
 
 A position that was read back is old by its own wire time, and at 4 mm/s a tenth of a millisecond is 0.4 um. So no
-report is ever used as "the position now". A driver tells this model what it commanded and when the bytes left, and
-the model lays the motion out as exact pieces of constant acceleration. What is not known are two numbers per
-command: how late it took effect (``delay``) and how far the motor was from where the model had it (``offset``).
-Every report that arrives corrects the two by a Kalman step, in the epoch of the command that was in force when it was
-*sampled*, however late it is; all later epochs are then laid out again. Past positions therefore get better with
-time, which is what a focus cycle needs: it looks up the instant of the crossing some milliseconds after it.
+report is ever used as "the position now". A driver tells this model what it commanded and when the bytes left, and the
+model lays the motion out as exact pieces of constant acceleration. What is not known are three numbers per command
+(``lessons``): how late it took effect, how far the motor was from where the model had it, and how much faster it runs
+than it was told. Every report that arrives corrects the three by a Kalman step, in the epoch of the command that was in
+force when it was *sampled*, however late it is; all later epochs are then laid out again. Past positions therefore get
+better with time, which is what a focus cycle needs: it looks up the instant of the crossing some milliseconds after it.
 
-The sensitivities are not derived by hand for each kind of motion: each epoch is laid out three times, as it is, begun
-a little later, and begun a little further. That covers ramps, reversals, absolute targets (whose end does not depend
-on either) and firmware that steps its speed in segments, with one formula. Where a command turns out to have taken
-effect much earlier or later than supposed (a stop behind a segment buffer), the epoch is laid out anew around the
+The first two sensitivities are not derived by hand for each kind of motion: each epoch is laid out three times, as it
+is, begun a little later, and begun a little further. That covers ramps, reversals, absolute targets (whose end does not
+depend on either) and firmware that steps its speed in segments, with one formula. Where a command turns out to have
+taken effect much earlier or later than supposed (a stop behind a segment buffer), the epoch is laid out anew around the
 better value and its reports are gone through again: a Gauss-Newton step.
 
 What it refuses to do: guess before the first report, or beyond its memory. It holds no clock, no port and no thread.
@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 
 from elpd.errors import LensError
 from elpd.motion.kinematics import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
+from elpd.motion.lessons import Lessons, Sensitivity
 from elpd.records import LensFlag, LensReport, PositionEstimate
 from elpd.units import NS_PER_S, HostNs
 
@@ -72,6 +73,7 @@ class Timing:
     motion, ``rest_quantum_steps`` at rest (0 for a controller that counts whole steps and rests on one).
     ``ramp_steps`` is how far firmware's ramps stray from the model's while the speed changes. A reply that took longer
     than ``prompt_ns`` was held up, nobody knows on which side of its sampling.
+    ``pace_sigma`` is by which share a motion may run faster or slower than it was told.
     """
 
     reply_ns: int
@@ -81,6 +83,7 @@ class Timing:
     rest_quantum_steps: float = 0.0
     ramp_steps: float = 0.0
     prompt_ns: int = 10_000_000
+    pace_sigma: float = 0.0
 
 
 @dataclass(slots=True)
@@ -105,40 +108,23 @@ class _Epoch:
     later: list[Knot] = field(default_factory=list)
     further: list[Knot] = field(default_factory=list)
     later_s: float = 0.0
-    offset: float = 0.0
-    delay: float = 0.0
-    p_oo: float = 0.0
-    p_od: float = 0.0
-    p_dd: float = 0.0
+    lessons: Lessons = field(default_factory=Lessons)
     reports: list[LensReport] = field(default_factory=list)
 
-    def forget_lessons(self) -> None:
+    def forget_lessons(self, pace_sigma: float) -> None:
         """Go back to what was supposed before any report."""
-        self.offset, self.delay = 0.0, (self.nominal_ns - self.start_ns) / NS_PER_S
-        self.p_oo, self.p_od, self.p_dd = self.variance, 0.0, self.delay_sigma_s**2
+        delay = (self.nominal_ns - self.start_ns) / NS_PER_S
+        self.lessons = Lessons.supposed(self.variance, delay, self.delay_sigma_s, pace_sigma)
 
-    def depends(self, when_ns: int) -> tuple[float, float, float, float]:
-        """Return position, velocity, and how the position depends on offset and delay."""
+    def depends(self, when_ns: int) -> tuple[float, float, Sensitivity]:
+        """Return position, velocity, and how the position depends on what is learnt."""
         steps, velocity = state_at(self.path, when_ns)
-        h_offset = (state_at(self.further, when_ns)[0] - steps) / _FURTHER_STEPS
-        h_delay = (state_at(self.later, when_ns)[0] - steps) / self.later_s if self.later_s else 0.0
-        return steps + h_offset * self.offset + h_delay * self.delay, velocity, h_offset, h_delay
-
-    def learnt(self, h_offset: float, h_delay: float) -> float:
-        """Return the variance of a position with these dependences."""
-        return h_offset * h_offset * self.p_oo + 2 * h_offset * h_delay * self.p_od + h_delay * h_delay * self.p_dd
-
-    def correct(self, surprise_steps: float, h_offset: float, h_delay: float, noise: float) -> None:
-        """Take one Kalman step on (offset, delay)."""
-        to_o = h_offset * self.p_oo + h_delay * self.p_od
-        to_d = h_offset * self.p_od + h_delay * self.p_dd
-        spread = h_offset * to_o + h_delay * to_d + noise
-        gain_o, gain_d = to_o / spread, to_d / spread
-        self.offset += gain_o * surprise_steps
-        self.delay += gain_d * surprise_steps
-        self.p_oo -= gain_o * to_o
-        self.p_od -= gain_o * to_d
-        self.p_dd -= gain_d * to_d
+        h = Sensitivity(
+            (state_at(self.further, when_ns)[0] - steps) / _FURTHER_STEPS,
+            (state_at(self.later, when_ns)[0] - steps) / self.later_s if self.later_s else 0.0,
+            velocity * max(when_ns - self.start_ns, 0) / NS_PER_S,
+        )
+        return steps + self.lessons.shift(h), velocity, h
 
 
 _FURTHER_STEPS = 1.0
@@ -149,7 +135,14 @@ MARK_NS = 2_000
 """A mark's edge leaves with the step, and a camera stamps it to the microsecond."""
 _UNLIKELY = 3.0
 """Standard deviations beyond which a report at rest shows that the model's own are too small."""
-_LOOK_STEP_NS, _AHEAD_NS, _LATE_NS = 1_000_000, 200_000_000, NS_PER_S
+_LOOK_STEP_NS = 1_000_000
+HELD_UP_NS = 100_000_000
+"""How late or early a motion may be on its way and still be the one commanded.
+
+Late, when the controller stood still for a moment; early, when its acknowledgement, by which the motion's beginning was
+dated, lay in an adapter. Whatever holds it or the line up for longer is a fault already: it has answered nothing for
+longer than any driver's silence limit. A position from further along is one that it was not sent to at that time.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +188,7 @@ class Trajectory:
         epoch.steps, epoch.variance = report.steps, self._reading_variance(velocity, 0.0)
         epoch.path = lay_out(when, report.steps, epoch.motion.pieces(report.steps, velocity))
         epoch.further = lay_out(when, report.steps + _FURTHER_STEPS, epoch.motion.pieces(report.steps, velocity))
-        epoch.forget_lessons()
+        epoch.forget_lessons(self._timing.pace_sigma)
         self._epochs = [epoch]
 
     def command(self, motion: Motion, effective_ns: int, sigma_ns: float) -> int:
@@ -228,9 +221,9 @@ class Trajectory:
         """Say how far *report* is from the model, without learning from it. Raises ``LensError`` before ``begin``."""
         when, sigma_s = self._sampled(report)
         epoch = self._epochs[self._index(when)]
-        steps, velocity, h_offset, h_delay = epoch.depends(when)
+        steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
-        variance = self._variance(epoch, velocity, h_offset, h_delay) + reading
+        variance = self._variance(epoch, velocity, h) + reading
         return Surprise(report.steps - steps, math.sqrt(variance))
 
     def observe(self, report: LensReport) -> None:
@@ -271,9 +264,9 @@ class Trajectory:
     def resume(self, report: LensReport) -> bool:
         """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
 
-        That is a motor that is where the model had it up to a second ago or will have it in 200 ms (what was held up
-        may have been the acknowledgement), under this command or, for a stop that bit late, one before. Anything else
-        is not believed: returns False, and nothing has changed.
+        That is a motor that is where the model had it up to ``HELD_UP_NS`` ago, or will have it so soon, under this
+        command or, for a stop that bit late, one before. Anything else is not believed: returns False, and nothing has
+        changed.
         """
         when, _ = self._sampled(report)
         index = self._index(when)
@@ -281,9 +274,9 @@ class Trajectory:
         if when <= present.start_ns or present.number == 0:
             return False
         for epoch in reversed(self._epochs[: index + 1]):
-            if epoch.start_ns < when - _LATE_NS and epoch is not present:
+            if epoch.start_ns < when - HELD_UP_NS and epoch is not present:
                 break
-            velocity = _velocity_where(epoch, report.steps, when + _AHEAD_NS)
+            velocity = _velocity_where(epoch, report.steps, when + HELD_UP_NS)
             if velocity is not None:
                 anchor = (report.steps, velocity if report.moving else 0.0)
                 self._epochs.insert(index + 1, _Epoch(when, when, present.motion, 0.0, present.number, anchor))
@@ -296,8 +289,8 @@ class Trajectory:
 
         Raises ``LensError`` before the first report and beyond the history.
         """
-        epoch, steps, velocity, h_offset, h_delay = self._state(when)
-        return PositionEstimate(steps, math.sqrt(self._variance(epoch, velocity, h_offset, h_delay)))
+        epoch, steps, velocity, h = self._state(when)
+        return PositionEstimate(steps, math.sqrt(self._variance(epoch, velocity, h)))
 
     def velocity_at(self, when: HostNs) -> float:
         """Return the modelled velocity in steps/s at *when*."""
@@ -322,7 +315,7 @@ class Trajectory:
         surprise = self.expect(report)
         return abs(surprise.steps) > _UNLIKELY * surprise.sigma_steps
 
-    def _state(self, when: int) -> tuple[_Epoch, float, float, float, float]:
+    def _state(self, when: int) -> tuple[_Epoch, float, float, Sensitivity]:
         if not self._epochs:
             raise LensError("lens: position asked for before the controller reported any; poll it first")
         oldest = self._epochs[0]
@@ -369,8 +362,8 @@ class Trajectory:
         """Lay epoch *index* out from the state in which its predecessor leaves the motor; go through its reports."""
         before, epoch = self._epochs[index - 1], self._epochs[index]
         start, motion = epoch.start_ns, epoch.motion
-        steps, velocity, h_offset, h_delay = before.depends(start)
-        epoch.steps, epoch.variance = steps, before.learnt(h_offset, h_delay) + motion.rounding_steps**2
+        steps, velocity, h = before.depends(start)
+        epoch.steps, epoch.variance = steps, before.lessons.variance(h) + motion.rounding_steps**2
         if epoch.anchor is not None:
             steps, velocity = epoch.anchor
             epoch.steps, epoch.variance = (
@@ -383,18 +376,18 @@ class Trajectory:
         epoch.later_s = min(epoch.delay_sigma_s, _RELAY_S)
         if epoch.later_s:
             late = start + round(epoch.later_s * NS_PER_S)
-            late_steps, late_velocity, _, _ = before.depends(late)
+            late_steps, late_velocity, _ = before.depends(late)
             epoch.later = [Knot(start, steps, velocity, 0.0)]
             epoch.later += lay_out(late, late_steps, motion.pieces(late_steps, late_velocity))
-        epoch.forget_lessons()
+        epoch.forget_lessons(self._timing.pace_sigma)
         for report in epoch.reports:
             self._correct(epoch, report)
 
     def _relay(self, index: int) -> bool:
         """Move an epoch's start to where its delay says, if that is far; say whether it moved."""
         epoch = self._epochs[index]
-        shift = round(epoch.delay * NS_PER_S)
-        if index == 0 or abs(epoch.delay) < _RELAY_S or not epoch.reports:
+        shift = round(epoch.lessons.delay * NS_PER_S)
+        if index == 0 or abs(epoch.lessons.delay) < _RELAY_S or not epoch.reports:
             return False
         moved = self._start_at(index, epoch.start_ns + shift)
         return abs(moved) > _RELAY_S * NS_PER_S / 2
@@ -417,14 +410,14 @@ class Trajectory:
 
     def _correct(self, epoch: _Epoch, report: LensReport) -> None:
         when, sigma_s = self._sampled(report)
-        steps, velocity, h_offset, h_delay = epoch.depends(when)
+        steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
         noise = reading + self._model_variance(epoch, velocity)
-        epoch.correct(report.steps - steps, h_offset, h_delay, noise)
+        epoch.lessons.correct(report.steps - steps, h, noise)
 
-    def _variance(self, epoch: _Epoch, velocity: float, h_offset: float, h_delay: float) -> float:
+    def _variance(self, epoch: _Epoch, velocity: float, h: Sensitivity) -> float:
         common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
-        return epoch.learnt(h_offset, h_delay) + common * common + self._model_variance(epoch, velocity)
+        return epoch.lessons.variance(h) + common * common + self._model_variance(epoch, velocity)
 
     def _model_variance(self, epoch: _Epoch, velocity: float) -> float:
         strays = self._timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0
@@ -440,10 +433,10 @@ class Trajectory:
 
 
 def _velocity_where(epoch: _Epoch, steps: float, until_ns: int) -> float | None:
-    """Return the velocity at which *epoch* passed *steps* in about a second before *until_ns*; None: it did not."""
+    """Return the velocity at which *epoch* passed *steps* a while before *until_ns*; None: it did not."""
     when = until_ns
     after, velocity = state_at(epoch.path, when)
-    while when > max(epoch.start_ns, until_ns - _AHEAD_NS - _LATE_NS):
+    while when > max(epoch.start_ns, until_ns - 2 * HELD_UP_NS):
         when -= _LOOK_STEP_NS
         before, velocity = state_at(epoch.path, max(when, epoch.start_ns))
         if min(before, after) <= steps <= max(before, after):

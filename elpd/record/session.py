@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from elpd.config import Config
     from elpd.ports import RigParts
-    from elpd.records import ElpSample, FocusResult, TemporalImage
-    from elpd.vision.reference import Reference
+    from elpd.records import FocusResult, TemporalImage
+    from elpd.vision.sharpest import Sharpest
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +37,8 @@ class Session:
     truth: dict[str, float | None] | None
     run: Path | None
     map: TemporalImage | None
-    reference: Reference | None = None
-    """The weights that the cycle ended with."""
-    passage: tuple[ElpSample, ...] = ()
-    """The windows of the last direction of travel."""
+    sharpest: Sharpest | None = None
+    """The picture in focus, as a ruler for its loss, where the sweep has seen it."""
 
     @property
     def focused(self) -> bool:
@@ -97,4 +95,5 @@ def focus_on(
     if isinstance(parts.lens, Remarks):  # about the line, not the cycle: a replay has none
         result = replace(result, warnings=(*result.warnings, *parts.lens.remarks))
     structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
-    return Session(result, truth, run.path, cycle.map, cycle.reference, cycle.passage)
+    ruler = cycle.sharpest(config.modes.defocus_dof) if result.outcome is Outcome.FOCUSED else None
+    return Session(result, truth, run.path, cycle.map, ruler)

@@ -15,7 +15,7 @@ from elpd.focus.settings import CycleSettings
 from elpd.records import Roi
 from elpd.service import modes, temperature
 from elpd.service.engine_port import Caller, Request
-from elpd.service.evidence import Evidence, allowance_of
+from elpd.service.evidence import Evidence
 from elpd.service.job import Job
 from elpd.service.kept import Thermometer
 from elpd.service.messages import FocusAnswer, FocusParams, ModeAnswer, MoveParams, TemperatureAnswer
@@ -209,10 +209,9 @@ class Autopilot:
     def _evidence_of(self, session: Session, result: FocusAnswer) -> Evidence | None:
         roi = result.details.get("roi")
         depths = self._config.modes.defocus_dof
-        allowance = allowance_of(session.passage, self._depth_um, depths)
-        if session.reference is None or roi is None or allowance is None:
+        if session.sharpest is None or roi is None:
             return None
-        return Evidence(session.reference, Roi(*roi), allowance)
+        return Evidence(session.sharpest.weights, Roi(*roi), session.sharpest.at(depths * self._depth_um))
 
     def _thermometer(self, focus_um: float, sign: int) -> Thermometer | None:
         if self._celsius is None or self._time.now_s() - self._read_s > READING_S:

@@ -1,9 +1,12 @@
 """Has the picture lost sharpness since it was focused? The events of a lens at rest say so.
 
-The Event Laplacian Product is the rate at which sharpness changes, whatever changes it, so its sum over a lens at rest
-is the sharpness lost since: by drift, by a knock, or because another subject stands there, whose picture has nothing to
-do with the one that was focused. How much matters is known from the sweep itself: what the same sum was over the last
-depths of focus before it.
+The Event Laplacian Product with the sharp picture is the rate at which sharpness changes, whatever changes it, so its
+sum over a lens at rest is the sharpness lost since: by drift, by a knock, or because another subject stands there,
+whose picture has nothing to do with the one that was focused. The sharp picture and how much matters are known from the
+sweep itself (``elpd.vision.sharpest``).
+
+There is a limit to it that no weighing moves: a change of blur that brings few pixels to their threshold sends few
+events, and noise hides them. What is smaller than about two depths of focus is mostly not heard.
 
 Over minutes noise would sum to more than that. So only changes are counted that noise would not make: those that stand
 ``SIGMAS`` above the random walk of the time that they took, which may be a tenth of a second or several. What is slower
@@ -23,13 +26,10 @@ import numpy as np
 from elpd.vision.resting import hot_pixels
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from elpd.events.decoder import EventArrays
-    from elpd.records import ElpSample, Roi
-    from elpd.vision.reference import Reference
+    from elpd.records import Roi
 
 SIGMAS = 6.0
 """Noise alone does this once in 5·10⁸ looks: with seven lengths of time, ten times a second, once in 80 days."""
@@ -55,16 +55,15 @@ class Evidence:
 
     Parameters
     ----------
-    reference, roi
-        The weights that the cycle judged by, and where.
+    weights, roi
+        What an ON event takes from sharpness in each pixel, (height, width) of the region, and where that is.
     allowance
-        The sum of ELP that counts as lost; see ``allowance_of``.
+        The sum over events that counts as lost; see ``elpd.vision.sharpest``.
     """
 
-    def __init__(self, reference: Reference, roi: Roi, allowance: float) -> None:
-        rows, columns = slice(roi.y, roi.y + roi.height), slice(roi.x, roi.x + roi.width)
+    def __init__(self, weights: NDArray[np.float64], roi: Roi, allowance: float) -> None:
         self._roi = roi
-        self._weights = reference.weights[rows, columns].astype(np.float64)
+        self._weights = weights
         self._allowance = allowance
         self._waiting: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self._waiting_events = 0
@@ -129,24 +128,3 @@ class Evidence:
                 self._lost = max(0.0, self._lost + float(lost))
                 self._bins.clear()
                 return
-
-
-def allowance_of(passage: Sequence[ElpSample], depth_of_focus_um: float, depths: float) -> float | None:
-    """Return the sum of ELP over the last *depths* of focus before the sharpest place of a sweep.
-
-    Where the sweep began nearer, the way beyond is taken; ``None`` where neither was seen.
-    """
-    known = [(sample.position_um, sample.elp) for sample in passage if np.isfinite(sample.position_um)]
-    if len(known) < 3:
-        return None
-    place = np.array([um for um, _ in known])
-    total = np.cumsum([elp for _, elp in known])
-    peak = int(np.argmax(total))
-    far = np.abs(place - place[peak]) >= depths * depth_of_focus_um
-    losses = []
-    before, beyond = np.flatnonzero(far[:peak]), np.flatnonzero(far[peak:])
-    if before.size:
-        losses.append(float(total[peak] - total[before[-1]]))
-    if beyond.size:
-        losses.append(float(total[peak] - total[peak + beyond[0]]))
-    return losses[0] if losses and losses[0] > 0 else None

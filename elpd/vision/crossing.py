@@ -25,7 +25,7 @@ from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, weights_of_li
 from elpd.vision.light import in_focus, worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
-from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
+from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, counted, hush, rebuilt, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -223,6 +223,7 @@ def ask_events(
     dark: float = DARK,
     *,
     hurried: bool = True,
+    lit: bool = False,
 ) -> EventWitnesses:
     """Rebuild the image over positions *begin* .. *end* and find its focus near *peak*, and the mirror pairs.
 
@@ -230,7 +231,7 @@ def ask_events(
     photoreceptor is; with it, the pairs themselves measure the lag. *unmeasured_lag* is how far the lens goes while a
     typical photoreceptor answers, as far as one may guess. Both witnesses are freed of the lag.
     *start*, as *brightness*, is what was seen when the first of the events came: the picture that they changed.
-    *hurried* says that a lens waits.
+    *hurried* says that a lens waits, *lit* that a lamp's flicker is among the events.
     *calibrated* is what a calibration says of the lag, instead of *unmeasured_lag*. *dark* is the dark current that
     *brightness* does not show, relative to the brightest parts.
     """
@@ -275,6 +276,9 @@ def ask_events(
         if (one := _image_focus(curve, ticks, peak, count)) is not None
     ]
     image = average_focus(candidates) if candidates else None
+    if lit:
+        plain = _curves(counted(events, ticks), None, (), weight, events.margin)[0]
+        image, pairs = between(image, _image_focus(plain, ticks, peak)), None
     energy, turning = _who_turns(at_peak, bend, weight)
     lags, expected = late.candidates, late.typical
     if energy.any():
@@ -310,6 +314,20 @@ def _typical(slowness: NDArray[np.float64], turning: NDArray[np.float32], energy
     if total <= 0.0:
         return by_energy
     return float(np.clip((slowness * turning).sum() / total, slowness.min(), slowness.max()))
+
+
+def between(mirrored: BandFocus | None, plain: BandFocus | None) -> BandFocus | None:
+    """Return the focus of a scene under a lamp: between that of turns that are mirrored and that of mere counting.
+
+    A pixel that is lit evenly must come back by a threshold and what it had risen beyond its last event before it
+    answers: a mirrored turn makes up for that. One that a lamp of amplitude A swings answers at the lamp's top as long
+    as it rises and at its bottom once it falls, 2·A sooner: by how much nobody knows, from nothing to all of it. So
+    half the difference of the two is the error, and mirror pairs, which are early by A over the slope, are not asked.
+    """
+    if mirrored is None or plain is None:
+        return None
+    apart = 0.5 * (plain.at - mirrored.at)
+    return replace(mirrored, at=mirrored.at + apart, sigma=float(np.hypot(mirrored.sigma, apart)))
 
 
 def _by_brightness(
@@ -470,12 +488,15 @@ def _pair_mode(
         unknown = [_lag_of(None, unmeasured_lag / float(one.mean()), calibrated) for one in slownesses]
         return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
     turns = Turns(middle, pairs.after[believed], weights, mode.at, PAIRS_KERNEL * past, smooth)
-    drawn = [turns.line(one[pairs.y, pairs.x][believed]) for one in slownesses]
+    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
+    usual = [float(np.average(one, weights=turns.near)) for one in slow]
+    drawn = [turns.line(one) for one in slow]
     lines = [line for line, _ in drawn]
-    typical = [float(np.average(slow, weights=turns.near)) for _, slow in drawn]
+    typical = [float(np.average(one, weights=turns.near)) for _, one in drawn]
     # A lag that differs from pixel to pixel spreads their midpoints, which is not to go astray.
-    mode = replace(mode, share=max(mode.share, *(turns.share(line, slow) for line, slow in drawn)))
-    # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation.
+    mode = replace(mode, share=max(mode.share, *(turns.share(line, one) for line, one in drawn)))
+    # Pairs that motion made turn at any time, and what they say of the lag is worth less than the expectation. That is
+    # of a receptor's own lag: pairs that came too soon to be late themselves do not make the receptors slower.
     doubt = min(1.0, _stray(mode) / ASTRAY) * DOUBT * unmeasured_lag
     late = [
         _lag_of(
@@ -483,7 +504,7 @@ def _pair_mode(
             unmeasured_lag / one,
             calibrated,
         )
-        for line, one in zip(lines, typical, strict=True)
+        for line, one in zip(lines, usual, strict=True)
     ]
     fit = weights_of_lines(lines)
     lag = average_lag([Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)], fit)

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 ROUNDS = 4
 """How often a line is drawn again through midpoints whose lateness it tells itself; two would nearly do."""
 
+LEAST_ANSWERED = 0.5
+"""Mean share of its lag that a pixel has when its pair is over, at the least: else the pairs tell of something else."""
+
 UNMEASURED_LAG_US = 1_000.0
 """What a typical pixel's lag may as well exceed as not when nothing tells."""
 
@@ -162,6 +165,8 @@ class Turns:
         ``tau·(1 - exp(-t/tau))`` a time t after the turn: a slow one has not caught up with the rise when its pair is
         complete, and is less late than its slowness says. How much less depends on the lag that the line is to tell, so
         it is drawn again. It is believed if the classes then lie closer to it; what something else scatters does not.
+        Pairs that motion makes may end at any time, so "how late" is how far they lie, and the line explains itself:
+        that shows in that most of them would be over before their receptors had answered.
         """
         near = self.near
         plain = line = line_of_classes(self.middle, self.weights, slowness, self.mode, self.width, self.smooth)
@@ -173,6 +178,8 @@ class Turns:
             late = -slowness * np.expm1(-np.maximum(self.after - focus, 0.0) / (line.slope * slowness))
             line = line_of_classes(self.middle, self.weights, late, self.mode, self.width, self.smooth)
         if plain is None or line is None or line.scatter > plain.scatter:
+            return plain, slowness
+        if float(np.average(late, weights=near)) < LEAST_ANSWERED * float(np.average(slowness, weights=near)):
             return plain, slowness
         return line, late
 

@@ -24,6 +24,8 @@ from elpd.vision.refractory import Refractory, refractory_period
 from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, SensorProfile
@@ -171,6 +173,22 @@ class EventMemory:
         np.add.at(change, (y[part], x[part]), 2 * on[part].astype(np.int32) - 1)
         return change
 
+    def within(self, roi: Roi) -> tuple[slice, slice]:
+        """Return where a region lies in the remembered images: rows, columns."""
+        top, left = roi.y - self._top, roi.x - self._left
+        return slice(top, top + roi.height), slice(left, left + roi.width)
+
+    def sums(self, weights: NDArray[np.float64], positions: Sequence[float]) -> NDArray[np.float64]:
+        """Return the sum over events of weight times sign, up to where the curve first passed each of *positions*.
+
+        *weights* is (height, width) of the remembered images.
+        """
+        _, x, y, on = (column[: self._count] for column in self._columns)
+        total = np.concatenate([[0.0], np.cumsum(weights[y, x] * (2.0 * on - 1.0))])
+        places, times = np.array(self.track.positions), np.array(self.track.times_us)
+        at = np.array([int(np.argmax(places >= one)) if (places >= one).any() else -1 for one in positions])
+        return np.asarray(total[np.searchsorted(self._t_us, times[at], side="left")])
+
     @property
     def _t_us(self) -> NDArray[np.int64]:
         times: NDArray[np.int64] = self._columns[0][: self._count]
@@ -228,12 +246,14 @@ class EventMemory:
         dark: float = DARK,
         *,
         hurried: bool = True,
+        lit: bool = False,
     ) -> EventWitnesses | None:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
         show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
-        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
+        that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer,
+        *lit* that a lamp's flicker is among the events.
         ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
         """
@@ -266,6 +286,7 @@ class EventMemory:
             LagPrior.of(self._sensor, ruler.speed_at(peak_us) if ruler.in_um else 0.0),
             dark,
             hurried=hurried,
+            lit=lit,
         )
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -283,7 +304,7 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
+        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False, lit=self.flicker() is not None)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None

@@ -46,6 +46,12 @@ class Rig:
         for name, value in values.items():
             self.thread.call(setattr, self.daemon, name, value)
 
+    def until_asked(self, method: str, params: dict[str, Any]) -> None:
+        """Wait until this was asked for last, however often before."""
+        self.thread.run(
+            self.daemon.until(lambda: [given for name, given in self.daemon.asked if name == method][-1:] == [params])
+        )
+
     def count(self, method: str) -> int:
         return [name for name, _ in self.daemon.asked].count(method)
 

@@ -98,11 +98,23 @@ def test_the_region_by_keyboard(opened: Opener, rig: Rig) -> None:
     page.keyboard.press("ArrowDown")
     page.keyboard.press("Shift+ArrowRight")
     page.keyboard.press("Control+ArrowUp")
-    assert rig.asked_for("roi", 3)["set"] == {"x": 504, "y": 223, "width": 296, "height": 288}
+    rig.until_asked("roi", {"set": {"x": 504, "y": 223, "width": 296, "height": 288}})
     expect(region).to_have_attribute("aria-label", "Region 296 by 288 pixels at 504, 223")
     page.keyboard.press("Delete")
-    assert rig.asked_for("roi", 4) == {"set": None}
+    rig.until_asked("roi", {"set": None})
     expect(region).to_have_attribute("aria-label", "No region: elpd chooses one")
+
+
+def test_a_status_that_is_late_takes_no_region_away_and_one_that_is_new_does(opened: Opener, rig: Rig) -> None:
+    page = opened()
+    late = rig.daemon._status()
+    rig.thread.call(rig.daemon.answers.__setitem__, "status", lambda _: late)
+    drag(page, (300, 200), (700, 500))
+    rig.asked_for("roi", 2)
+    rig.asked_for("status", rig.count("status") + 3)
+    expect(page.locator("#region-summary")).to_contain_text("Region")
+    late["roi"] = {"x": 8, "y": 16, "width": 64, "height": 32}  # somebody else's
+    expect(page.locator("#region-summary")).to_have_text("Region 64 × 32 at 8, 16")
 
 
 def test_a_region_is_saved_and_chosen_by_name(opened: Opener, rig: Rig) -> None:

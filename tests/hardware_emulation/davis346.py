@@ -70,6 +70,10 @@ class Davis346:
         self._stream.put(words)
         return True
 
+    def forget(self) -> None:
+        """Drop the packets that wait for the host to ask."""
+        self._stream.forget()
+
     def stall(self) -> None:
         """Let the next request for words fail, as an endpoint does that has lost its way."""
         self._stream.stall()

@@ -50,6 +50,10 @@ class Evk4:
         """Let the next request for events fail, as an endpoint does that has lost its way."""
         self._stream.stall()
 
+    def forget(self) -> None:
+        """Drop the packets that wait for the host to ask."""
+        self._stream.forget()
+
     def answer_when_sent(self) -> None:
         """Answer frames again once the host has taken every packet of events."""
         self._answer_then = True

@@ -300,6 +300,7 @@ def test_what_the_usb_loses_is_a_gap_and_counted(rig: Rig) -> None:
                 rig.davis.send(words.take(), "events")
             packet = camera.read(0)
             gaps += packet is not None and packet.gap_before
+    rig.davis.forget()
 
 
 def test_a_camera_that_another_program_holds_says_so(rig: Rig) -> None:

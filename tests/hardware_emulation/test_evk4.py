@@ -223,6 +223,8 @@ def test_what_the_usb_loses_is_a_gap_and_counted(started: Rig) -> None:
     started.wait_for(lambda: camera.counters["usb_overflows"] > 0)
     assert 100 <= camera.counters["usb_packets_dropped"] < 300
     assert seen < 200
+    evk4.forget()
+    camera.close()  # with what is still on its way
 
 
 def test_events_that_the_rate_controller_held_back_are_lost_events(started: Rig) -> None:

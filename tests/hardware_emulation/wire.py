@@ -54,6 +54,10 @@ class Outbox:
         """Queue a packet; one that is longer than the host asks for goes in several."""
         self._waiting.append(packet)
 
+    def forget(self) -> None:
+        """Drop what waits."""
+        self._waiting.clear()
+
     def stall(self) -> None:
         """Let the next request fail, as an endpoint does that has lost its way."""
         self._waiting.appendleft(None)

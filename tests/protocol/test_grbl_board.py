@@ -262,7 +262,7 @@ def test_idle_alone_is_no_reference(made: Rig) -> None:
         made.lens.move_to(Steps(1000), 12_800.0)
 
 
-@pytest.mark.parametrize(("firmware", "onset"), [("grbl", 45), ("grblhal", 45), ("fluidnc", 45), ("sce2", 90)])
+@pytest.mark.parametrize(("firmware", "onset"), [("grbl", 45), ("grblhal", 16.5), ("fluidnc", 45), ("sce2", 90)])
 def test_every_dialect_homes_moves_reverses_and_stops(firmware: str, onset: float) -> None:
     made = open_rig("grbl", referenced=False, firmware=firmware)
     assert made.lens.capabilities.stop_onset_ms == onset
@@ -280,8 +280,9 @@ def test_every_dialect_homes_moves_reverses_and_stops(firmware: str, onset: floa
     made.live(300)
     assert not made.moving
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=2.1)
-    sped = made.motor.motor_steps(np.array([sent, sent + round((onset - 12) * 1e6)], dtype=np.int64))
-    assert sped[0] - sped[1] == pytest.approx(12.8 * (onset - 12), rel=0.02), "nothing bites before what is prepared"
+    still_ms = onset - 12 if onset > 20 else 8
+    sped = made.motor.motor_steps(np.array([sent, sent + round(still_ms * 1e6)], dtype=np.int64))
+    assert sped[0] - sped[1] == pytest.approx(12.8 * still_ms, rel=0.02), "nothing bites before what is prepared"
 
 
 @pytest.mark.parametrize("version", ["[VER:0.9j.20160303:]", "[VER:2.0.Marlin:]"])
@@ -308,7 +309,7 @@ def test_a_motion_that_the_board_holds_up_goes_on_from_where_it_is() -> None:
     made = open_rig("grbl")
     made.lens.run(3_200.0, made.soon(3000))
     made.live(60)
-    made.board._offset -= 160  # 50 ms of its way are missing from now on
+    made.board.stepper.offset -= 160  # 50 ms of its way are missing from now on
     made.live(200)
     estimate = made.lens.position_at(made.clock.now_ns()).steps
     assert estimate == pytest.approx(made.rotor - 160, abs=8)
@@ -364,3 +365,99 @@ def test_no_bytes_upset_the_board(data: bytes) -> None:
     made.port.write(data)
     made.clock.pass_ms(60)
     assert -64.0 <= made.rotor <= made.motor.travel_steps + 64.0
+
+
+# --- what the others of the family say ---------------------------------------------------------------------------
+
+
+def boot(firmware: str) -> tuple[Rig, str]:
+    fresh = rig("grbl", referenced=False, firmware=firmware)
+    return fresh, say(fresh, b"", 60)
+
+
+def test_grblhal_tells_its_story() -> None:
+    made, greeting = boot("grblhal")
+    assert greeting == "\r\nGrblHAL 1.1f ['$' or '$HELP' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
+    assert "[FIRMWARE:grblHAL]" in say(made, b"$I\n")
+    assert say(made, b"$HX\n") == "error:5\r\n", "one axis alone takes a flag of $22"
+    say(made, b"$22=3\n$HX\n", 60)
+    assert "<Home|" in say(made, b"?"), "it tells of itself while homing"
+    made.clock.pass_ms(3000)
+    assert made.port.read_available().endswith(b"ok\r\n")
+    assert "|H:1,1>" in say(made, b"\x87")
+    say(made, b"$20=0\n$J=G91X-2F240\n", 400)
+    assert "<Alarm:1|" in say(made, b"?"), "it answers after a hard limit"
+    assert say(made, b"$H\n$X\n") == "error:79\r\nerror:79\r\n", "but does nothing before a reset"
+    assert "GrblHAL 1.1f" in say(made, b"\x18", 60)
+    assert "H:0,0" in say(made, b"\x87")
+
+
+def test_our_driver_homes_grblhal_as_its_settings_allow_and_asks_it_whether_it_is_homed() -> None:
+    made = rig("grbl", referenced=False, firmware="grblhal")
+    lens = made.open(trust_position=False)
+    assert (lens.limits.min_steps, lens.limits.max_steps) == (160, 7840), "a pull-off at either end"
+    assert LensFlag.REFERENCED in lens.home(made.soon(9000)).flags
+    lens.move_to(Steps(160), 12_800.0)
+    made.live(400)
+    assert made.rotor == pytest.approx(160, abs=2.1), "as far as it may"
+    lens.close()
+    made.plug_in()
+    made.open(trust_position=False).move_to(Steps(1000), 12_800.0)
+    made.live(400)
+    assert made.rotor == pytest.approx(1000, abs=2.1)
+
+
+def test_after_a_hard_limit_our_driver_resets_grblhal_before_it_homes() -> None:
+    made = open_rig("grbl", firmware="grblhal")
+    made.motor.slip(made.clock.now_ns(), 600.0)
+    made.lens.run(-12_800.0, made.soon(3000))
+    with pytest.raises(LensError, match="hard limit"):
+        made.live(1000)
+    made.plug_in()
+    lens = made.open()
+    assert LensFlag.REFERENCED in lens.home(made.soon(9000)).flags
+
+
+def test_an_origin_at_the_place_of_homing_is_refused() -> None:
+    made = rig("grbl", firmware="grblhal")
+    say(made, b"$22=9\n")
+    with pytest.raises(Exception, match=r"\$22 is 9.*set \$22=1"):
+        made.open()
+
+
+def test_fluidnc_tells_its_story() -> None:
+    made, greeting = boot("fluidnc")
+    assert greeting == "\r\nGrbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
+    assert "[VER:3.7 FluidNC v3.7.8:]" in say(made, b"$I\n")
+    say(made, b"$HX\n", 30)
+    assert "<Home|" in say(made, b"?")
+    made.clock.pass_ms(3000)
+    assert made.port.read_available().endswith(b"ok\r\n")
+    assert "<Idle|MPos:-2.450,0.000,0.000|" in say(made, b"?")
+    assert say(made, b"$J=X9F100\n") == "error:15\r\n"
+
+
+def test_sce2_tells_its_story() -> None:
+    made, greeting = boot("sce2")
+    assert greeting == "\r\nGrbl 1.1f-SCE2 ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n"
+    assert "[VER:1.1f-SCE2.20211130:L086,6ZG-BEG19]" in say(made, b"$I\n")
+    assert say(made, b"$HX\n", 40) == ""
+    made.clock.pass_ms(3000)
+    assert made.port.read_available().endswith(b"ok\r\n")
+    assert "<Idle|MPos:-2.450,0.000,0.000,0.000|" in say(made, b"?"), "four axes"
+    assert say(made, b"M114P1\nM114P0\n", 40) == "ok\r\nok\r\n", "its iris"
+
+
+@pytest.mark.parametrize(
+    ("line", "state"),
+    [
+        ("<Alarm:11|MPos:-1.500,0.000,0.000|FS:0,0>", "Alarm"),
+        ("<Run:2|MPos:-1.500,0.000,0.000|FS:0,0>", "Run"),
+        ("<Tool|MPos:-1.500,0.000,0.000|Bf:100,1023|FS:0,0>", "Tool"),
+        ("<Hold:0|MPos:-1.500,0.000,0.000,0.000|FS:0,0|SD:3,x.nc>", "Hold:0"),
+    ],
+)
+def test_status_words_of_the_family_are_understood(line: str, state: str) -> None:
+    status = parse_status(line)
+    assert status is not None
+    assert (status.state, status.x_mm, status.homed) == (state, -1.5, False)

@@ -8,7 +8,7 @@ import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
-from served import ELPD, PATIENCE_S, Served, serving_in
+from served import ELPD, PATIENCE_S, Connection, Served, serving_in
 
 from elpd.cli.sim_board import find_board
 
@@ -86,14 +86,12 @@ def test_sighup_takes_a_good_configuration_and_refuses_a_bad_one(serve: Callable
     daemon.heard_until("RELOADING=1")
     daemon.heard_until("READY=1")
     connection = daemon.connect()
-    warnings = connection.call("status")["result"]["warnings"]
-    assert [one["code"] for one in warnings] == ["config-refused"]
-    assert "elpd.toml:13" in warnings[0]["text"]
+    assert "elpd.toml:13" in warned(connection)["config-refused"]
     path.write_text(good + "[focus]\ndeadline_ms = 1\n")
     daemon.process.send_signal(signal.SIGHUP)
     daemon.heard_until("RELOADING=1")
     daemon.heard_until("READY=1")
-    assert connection.call("status")["result"]["warnings"] == []
+    assert "config-refused" not in warned(connection)
     assert connection.call("focus")["result"]["outcome"] == "DEADLINE"
 
 
@@ -136,6 +134,11 @@ def test_parking_stops_a_lens_that_nobody_drives_any_more() -> None:
         "stopped": False,
         "reason": "a simulated lens ends with its daemon: there is nothing to stop",
     }
+
+
+def warned(connection: Connection) -> dict[str, str]:
+    """Return the warnings of a daemon by their codes; a busy machine has one of its own."""
+    return {one["code"]: one["text"] for one in connection.call("status")["result"]["warnings"]}
 
 
 def _elpd(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import Rig, rig
 
+from elpd.errors import LensError
 from elpd.records import LensFlag
 
 
@@ -276,3 +277,20 @@ def test_it_homes_faster_than_the_lens_may_sweep() -> None:
     made.open(max_speed_um_s=100.0)  # the board homes at its own settings' speed, which is higher
     report = made.lens.home(made.soon(60_000))
     assert LensFlag.REFERENCED in report.flags
+
+
+@pytest.mark.parametrize("start_um", [0.0, 0.3125, 1.25])
+def test_homing_may_end_between_two_looks(start_um: float) -> None:
+    made = rig("tic", start_um=start_um)
+    lens = made.open(query_ms=50.0, reply_ms=200.0)
+    report = lens.home(made.soon(5000))
+    assert LensFlag.REFERENCED in report.flags
+    assert report.steps == 0.0
+    assert made.rotor == pytest.approx(0.0, abs=1.0)
+
+
+def test_a_tic_that_takes_no_notice_of_homing_is_not_believed_to_have_homed() -> None:
+    made = rig("tic", start_um=0.0, limit_switches=False)
+    lens = made.open(query_ms=50.0, reply_ms=200.0)
+    with pytest.raises(LensError, match="did not start to home"):
+        lens.home(made.soon(5000))

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from elpd.events.decoder import EventArrays
-from elpd.records import ElpSample, Roi
-from elpd.service.evidence import AFTERGLOW_S, BIN_S, Evidence, allowance_of
-from elpd.vision.reference import Reference
+from elpd.records import Roi
+from elpd.service.evidence import AFTERGLOW_S, BIN_S, Evidence
 
 SIDE = 40
 ROI = Roi(10, 10, SIDE, SIDE)
@@ -16,10 +15,9 @@ ALLOWANCE = 100_000.0
 
 
 def evidence(rng: np.random.Generator) -> tuple[Evidence, np.ndarray]:
-    weights = np.zeros((60, 60), np.int16)
-    weights[10:50, 10:50] = rng.normal(0, 300, (SIDE, SIDE)).astype(np.int16)
-    reference = Reference(weights, 20.0, 1.0, np.ones((60, 60), np.float32))
-    return Evidence(reference, ROI, ALLOWANCE), weights
+    weights = np.zeros((60, 60))
+    weights[10:50, 10:50] = rng.normal(0, 300, (SIDE, SIDE))
+    return Evidence(weights[10:50, 10:50], ROI, ALLOWANCE), weights
 
 
 def events(x: np.ndarray, y: np.ndarray, on: np.ndarray) -> EventArrays:
@@ -86,16 +84,3 @@ def test_what_comes_before_the_pixels_have_settled_is_not_heard() -> None:
     heard.hear(events(columns, rows, weights[rows, columns] > 0), 0.9 * AFTERGLOW_S)
     listen(heard, rng, AFTERGLOW_S, 3.0)
     assert heard.loss == 0.0
-
-
-def test_what_counts_as_lost_is_what_the_sweep_gained_last() -> None:
-    places = np.arange(-60.0, 13.0, 1.0)
-    sharpness = -(places**2)
-    passage = [
-        ElpSample(0, 1, round(gain), 1, 1, 1, position_um=float(place), travel_um=1.0)
-        for place, gain in zip(places[1:], np.diff(sharpness), strict=True)
-    ]
-    allowance = allowance_of(passage, depth_of_focus_um=6.0, depths=2.0)
-    assert allowance == pytest.approx(144.0)
-    assert allowance_of(passage[:2], 6.0, 2.0) is None
-    assert allowance_of(passage[-8:], 6.0, 20.0) is None

@@ -92,7 +92,7 @@ class Retina:
         self, first: NDArray[np.float32], begin_us: int, end_us: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.uint8]]:
         """Draw all shot noise: Poisson in time, thinned by brightness, either polarity alike."""
-        rate = self._settings.shot_noise_rate_hz * (1.0 - (1.0 - _DARK_NOISE) * _relative(first.ravel()))
+        rate = self._settings.shot_noise_rate_hz * (1.0 - (1.0 - _DARK_NOISE) * relative_bandwidth(first.ravel()))
         counts = rng.poisson(rate * (end_us - begin_us) / 1e6)
         pixel = np.repeat(np.arange(counts.size), counts)
         t_us = rng.uniform(begin_us, end_us, pixel.size)
@@ -104,7 +104,7 @@ class Retina:
         """Take the next frame (height, width), seen at *t_us*; events since the last one are kept."""
         span_us = t_us - self._t_us
         intensity = frame.ravel().astype(np.float64)
-        follow = 1.0 - np.exp(-span_us * np.maximum(_relative(intensity), 1e-3) / self._tau_us)
+        follow = 1.0 - np.exp(-span_us * np.maximum(relative_bandwidth(intensity), 1e-3) / self._tau_us)
         level = self._level + follow * (lin_log(intensity) - self._level)
         self._reference -= self._settings.leak_rate_hz * span_us / 1e6 * self._thresholds[:, 0]
         stop = int(np.searchsorted(self._noise_t_us, t_us, side="left"))
@@ -157,7 +157,7 @@ def lin_log(intensity: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(intensity > LINEAR_BELOW, np.log(np.maximum(intensity, LINEAR_BELOW)), intensity * slope)
 
 
-def _relative(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
+def relative_bandwidth(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return v2e's brightness between 0 and 1, offset so that black still has some bandwidth."""
     return np.clip((np.asarray(intensity, dtype=np.float64) + 20.0) / 275.0, 0.0, 1.0)
 

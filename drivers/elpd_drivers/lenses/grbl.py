@@ -14,7 +14,6 @@ in the position, until the lens is homed. Steps count from the lower end of GRBL
 
 from __future__ import annotations
 
-from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -34,19 +33,9 @@ from elpd_drivers.lenses.axis import (
 )
 from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
-from elpd_drivers.lenses.grbl_lines import (
-    ALARM_WORDS,
-    CANCEL,
-    ERROR_WORDS,
-    OUTPUTS,
-    RESET,
-    STATUS,
-    Status,
-    jog_line,
-    parse_status,
-)
+from elpd_drivers.lenses.grbl_lines import CANCEL, OUTPUTS, RESET, jog_line
+from elpd_drivers.lenses.grbl_talk import GrblTalk
 from elpd_drivers.lenses.line import Trouble, open_on_line
-from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
 
 if TYPE_CHECKING:
@@ -57,9 +46,11 @@ if TYPE_CHECKING:
     from elpd_drivers.lenses.line import Line, Sent
 
 SEGMENT_S = 0.010
-STOPS_TRIED = 3
-RESTART_MS = 1500.0
-"""How long the board may be silent after a reset: in motion, it sleeps for half a second over its alarm."""
+RAMP_STEPS = 1.5
+"""How far its ramps, and where a stop comes to rest, stray from the model's segments."""
+
+PACE_SIGMA = 1e-3 / 3**0.5
+"""Pulses are made by a timer of 8 to 16 kHz whose period is rounded to a cycle of 16 MHz: one in a thousand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,22 +75,15 @@ class GrblLens:
 
     def __init__(self, settings: GrblLensSettings, clock: Clock, line: Line) -> None:
         self._settings, self._clock, self._line = settings, clock, line
-        self._lines = LineReader()
-        self._asking = Asking(settings.query_ms, settings.reply_ms, lost_share=1 / 3)
-        self._sampled_from_ns = 0
-        self._line_begun_ns = self._line_end_ns = 0
-        self._unacknowledged: deque[int | None] = deque()
-        self._status: Status | None = None
         self._wish: _Wish | None = None
         self._measured: dict[StopMode, StopTiming] = {}
         self._cruise_sps = 0.0
-        self._stopping = False
-        self._resetting = self._locked_by_stop = False
-        self._restarted_by_ns = 0
         self._limits = limits_from(settings.um_per_step, 0.0, 1.0, 1.0, 1.0)
-        self._steps_per_mm = self._travel_mm = 0.0
         self._dialect = DIALECTS[-1]
+        self._home_line = self._dialect.home
         self._motor = self._new_motor()
+        asking = Asking(settings.query_ms, settings.reply_ms, lost_share=1 / 3)
+        self._talk = GrblTalk(line, clock, asking, self._motor)
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -130,13 +114,14 @@ class GrblLens:
         """Identify the board, stop it if it moves, read its settings, and take its first report."""
         with self._guarded():
             board = handshake(self._line, self._clock, self._settings)
-            self._limits, self._steps_per_mm, self._travel_mm = board.limits, board.steps_per_mm, board.travel_mm
-            self._dialect = board.dialect
-            self._motor = self._new_motor()
+            self._limits, self._dialect, self._home_line = board.limits, board.dialect, board.home
+            talk = self._talk
+            talk.steps_per_mm, talk.travel_mm = board.steps_per_mm, board.travel_mm
+            self._motor = talk.motor = self._new_motor(board.steps_per_mm)
             believed = board.homed or (board.idle and self._settings.trust_position)
             self._motor.referenced = believed and not board.restarted
             due = after_ms(self._clock.now_ns(), 4 * self._settings.reply_ms)
-            while self._poll(fuse=True) is None:
+            while self._talk.poll(fuse=True) is None:
                 self._wait(due, "no report after connecting; check the cable")
 
     def home(self, deadline: HostNs) -> LensReport:
@@ -163,18 +148,14 @@ class GrblLens:
         """Write the stop byte now, from any thread. ``ABRUPT`` is a reset: the position is lost if in motion."""
         self._motor.stops += 1
         self._wish = None
-        data = RESET if mode is StopMode.ABRUPT else CANCEL
-        if mode is StopMode.ABRUPT:
-            self._resetting = self._locked_by_stop = True
-            self._restarted_by_ns = after_ms(self._clock.now_ns(), RESTART_MS)
-        sent = self._line.send(data)
+        sent = self._talk.reset() if mode is StopMode.ABRUPT else self._line.send(CANCEL)
         self._note_stop(mode, sent)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 
     def poll(self) -> LensReport | None:
         """Ask when due, read what has come, take the next step of a reversal; return a new report if there is one."""
         with self._guarded():
-            report = self._poll(fuse=True)
+            report = self._talk.poll(fuse=True)
             self._take_next_step()
             return None if report is None else self._flagged(report)
 
@@ -186,16 +167,15 @@ class GrblLens:
     @property
     def remarks(self) -> Sequence[str]:
         """What a person should know of how GRBL answers."""
-        return self._asking.remarks
+        return self._talk.asking.remarks
 
     def set_output(self, name: str, *, on: bool) -> CommandStamp:
         """Switch an output. At rest only: in motion the line would wait behind the jog, or be refused."""
         check_output(name, self.outputs)
         with self._guarded():
-            if self._busy() or (self._status is not None and self._status.state != "Idle"):
+            if self._talk.busy or (self._talk.status is not None and self._talk.status.state != "Idle"):
                 raise LensError(f"lens: GRBL switches {name} at rest only; wait until the motor stands, home if locked")
-            self._unacknowledged.append(None)
-            sent = self._line.send(OUTPUTS[name][0 if on else 1])
+            sent = self._talk.order(OUTPUTS[name][0 if on else 1])
         return CommandStamp(f"{name} {'on' if on else 'off'}", sent.begun_ns, sent.done_ns)
 
     def position_at(self, when: HostNs) -> PositionEstimate:
@@ -224,39 +204,37 @@ class GrblLens:
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def _home(self, deadline: HostNs) -> LensReport:
-        while self._resetting:
-            self._poll(fuse=False)
+        while self._talk.resetting:
+            self._talk.poll(fuse=False)
             self._wait(deadline, "the board did not come back from a reset; look at the board")
         if self._motor.report is not None and self._motor.report.moving:
             self.stop(StopMode.RAMPED)
             self._await_idle(deadline)
         self._motor.referenced, self._motor.rest_due_ns, self._wish = False, None, None
-        self._unacknowledged.append(None)
-        self._line.send(self._dialect.home)
-        self._asking.forget()
-        while self._unacknowledged:
-            self._take_lines(fuse=False)
+        self._talk.order(self._home_line)
+        self._talk.asking.forget()
+        while self._talk.unacknowledged:
+            self._talk.take(fuse=False)
             self._wait(deadline, "homing did not end before its deadline; check the limit switch, or allow more time")
         report = None
         while report is None:
-            report = self._poll(fuse=False)
+            report = self._talk.poll(fuse=False)
             self._wait(deadline, "no report after homing; check the cable")
-        if self._status is None or self._status.state != "Idle":
-            raise Trouble(f"homing ended in state {self._status.state if self._status else 'unknown'}")
+        if self._talk.status is None or self._talk.status.state != "Idle":
+            raise Trouble(f"homing ended in state {self._talk.status.state if self._talk.status else 'unknown'}")
         self._motor.begin(report)
-        self._motor.referenced, self._locked_by_stop = True, False
+        self._motor.referenced, self._talk.locked_by_stop = True, False
         if self._dialect.remembers:
-            self._unacknowledged.append(None)
-            self._line.send(f"T{HOMED_BY_US}\n".encode("ascii"))
-            while self._unacknowledged:
-                self._take_lines(fuse=True)
+            self._talk.order(f"T{HOMED_BY_US}\n".encode("ascii"))
+            while self._talk.unacknowledged:
+                self._talk.take(fuse=True)
                 self._wait(deadline, "no answer after homing; check the cable")
         return self._flagged(report)
 
     def _await_idle(self, deadline: HostNs) -> None:
         while True:
-            self._poll(fuse=self._motor.known)
-            ended = self._status is not None and self._status.state in {"Idle", "Alarm"}
+            self._talk.poll(fuse=self._motor.known)
+            ended = self._talk.status is not None and self._talk.status.state in {"Idle", "Alarm"}
             if ended and self._motor.rest_due_ns is None:
                 return
             self._wait(deadline, "the motor did not come to rest; look at the board")
@@ -265,24 +243,21 @@ class GrblLens:
 
     def _begin(self, wish: _Wish, name: str) -> CommandStamp:
         """Jog now if at rest; else cancel, and let ``poll`` jog when the motor stands."""
-        if self._resetting:
+        if self._talk.resetting:
             raise LensError("lens: GRBL restarts after an abrupt stop; home it first")
         now, stops = self._clock.now_ns(), self._motor.stops
-        if not self._busy():
+        if not self._talk.busy:
             return self._jog(wish, name, stops)
-        if wish.target is None and wish.speed_sps == self._cruise_sps and not self._stopping:
+        if wish.target is None and wish.speed_sps == self._cruise_sps and not self._talk.stopping:
             due = self._motor.rest_due_ns or now
             if due <= wish.until_ns:
                 return CommandStamp(name, now, now)  # already running so, and ending in time
-        stamp = CommandStamp(name, now, now) if self._stopping else self.stop(StopMode.RAMPED)
+        stamp = CommandStamp(name, now, now) if self._talk.stopping else self.stop(StopMode.RAMPED)
         self._wish = wish
         return CommandStamp(name, stamp.begun_ns, stamp.done_ns)
 
-    def _busy(self) -> bool:
-        return self._motor.rest_due_ns is not None or bool(self._unacknowledged)
-
     def _jog(self, wish: _Wish, name: str, stops: int) -> CommandStamp:
-        if self._status is not None and self._status.state == "Alarm":
+        if self._talk.status is not None and self._talk.status.state == "Alarm":
             raise LensError("lens: GRBL is locked (Alarm), its position is unknown; home it first")
         now = self._clock.now_ns()
         steps, _ = self._motor.state_at(now)
@@ -294,12 +269,14 @@ class GrblLens:
         if target == round(steps):
             return CommandStamp(name, now, now)
         speed_sps = abs(wish.speed_sps)
-        line = jog_line(target / self._steps_per_mm - self._travel_mm, speed_sps / self._steps_per_mm * 60)
+        line = jog_line(
+            target / self._talk.steps_per_mm - self._talk.travel_mm, speed_sps / self._talk.steps_per_mm * 60
+        )
         sent = self._line.send(line)
         motion = Motion(self._limits.acceleration_sps2, 0.0, float(target), speed_sps, SEGMENT_S)
         number = self._motor.command(motion, sent.off_wire_ns + 2 * NS_PER_MS, 2 * NS_PER_MS)
-        self._unacknowledged.append(number)
-        self._cruise_sps, self._stopping, self._motor.stops_ignored = wish.speed_sps, False, 0
+        self._talk.unacknowledged.append(number)
+        self._cruise_sps, self._talk.stopping, self._motor.stops_ignored = wish.speed_sps, False, 0
         if self._motor.stops != stops:
             self.stop(StopMode.RAMPED)  # one came from another thread while this was on its way: it wins
         return CommandStamp(name, sent.begun_ns, sent.done_ns)
@@ -309,11 +286,11 @@ class GrblLens:
         if not motor.known:
             return
         if mode is StopMode.ABRUPT:
-            moving = self._busy() or (motor.report is not None and motor.report.moving)
+            moving = self._talk.busy or (motor.report is not None and motor.report.moving)
             motor.referenced = motor.referenced and not moving
-            self._unacknowledged.clear()
+            self._talk.unacknowledged.clear()
             motor.command(REST, sent.off_wire_ns + 20 * NS_PER_US, 50 * NS_PER_US, grace_ms=50)
-        elif not self._stopping and self._busy():
+        elif not self._talk.stopping and self._talk.busy:
             onset_ns = sent.off_wire_ns + round(self._stop_onset_ms * NS_PER_MS)
             sigma_ms, braking_sps2 = self._stop_onset_sigma_ms, self._limits.acceleration_sps2
             measured = self._measured.get(mode)
@@ -322,142 +299,40 @@ class GrblLens:
                 sigma_ms, braking_sps2 = measured.onset_sigma_ms, measured.deceleration_sps2 or braking_sps2
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
-                braking = Motion(braking_sps2, segment_s=SEGMENT_S)
+                braking = Motion(braking_sps2, segment_s=SEGMENT_S, rounding_steps=RAMP_STEPS)
                 motor.command(braking, onset_ns, sigma_ms * NS_PER_MS, grace_ms=60)
-        self._stopping = True
+        self._talk.stopping = True
 
     def _take_next_step(self) -> None:
         stops = self._motor.stops
-        if self._wish is None or self._busy():
+        if self._wish is None or self._talk.busy:
             return
         wish, self._wish = self._wish, None
         self._jog(wish, "run", stops)
 
-    # --- queries and replies ---------------------------------------------------------------------------------------
-
-    def _poll(self, *, fuse: bool) -> LensReport | None:
-        report = self._take_lines(fuse=fuse)
-        now = self._line.looked_ns
-        if self._resetting:
-            if now >= self._restarted_by_ns:
-                raise Trouble(f"no banner within {RESTART_MS:.0f} ms of a reset; check the cable and the supply")
-            return report
-        self._asking.check(now, "")
-        if self._asking.due(now):
-            sent = self._line.send(STATUS)
-            self._sampled_from_ns = sent.off_wire_ns
-            self._asking.asked(sent.done_ns)
-        return report
-
-    def _take_lines(self, *, fuse: bool) -> LensReport | None:
-        """Read and act on every complete line; return the newest report."""
-        data = self._line.read()
-        before, now = self._line.since_ns, self._line.by_ns
-        newest, newest_begun = None, None
-        for line, bytes_after in self._lines.feed(data):
-            # when the line's first byte can have left the board, at the latest
-            length_ns = (len(line) + 2) * self._line.byte_ns
-            begun = now - length_ns - bytes_after * self._line.byte_ns
-            if line.startswith("<"):
-                status = parse_status(line)
-                newest = (self._take_status(status, begun, fuse=fuse) if status else None) or newest
-            elif line == "ok":
-                # not before the last look at the port, unless it had to wait behind the line before it
-                waited = before - length_ns < self._line_end_ns
-                self._acknowledged(self._line_begun_ns if waited else before - length_ns, begun)
-            else:
-                self._heed(line)
-            self._line_begun_ns = min(before - length_ns, begun)  # for what comes with it: nobody looked in between
-            self._line_end_ns = begun + length_ns
-            newest_begun = begun
-        if newest_begun is not None:
-            self._line_begun_ns = newest_begun
-        return newest
-
-    def _acknowledged(self, earliest: int, latest: int) -> None:
-        """Take an ``ok``: the jog was planned just before it was sent."""
-        if not self._unacknowledged:
-            return
-        number = self._unacknowledged.popleft()
-        if number is None:
-            return
-        earliest -= self._asking.held_ns
-        width = max(latest - earliest, 0)
-        sigma_ns = max(width / 12**0.5, 100 * NS_PER_US)
-        self._motor.amend(number, latest - width // 2, sigma_ns, still_ending=not self._stopping)
-        if self._stopping:
-            self._line.send(CANCEL)  # the first one may have come before there was anything to cancel
-
-    def _heed(self, line: str) -> None:
-        """Act on what the board says by itself."""
-        if line.startswith("ALARM:"):
-            if self._resetting:
-                return
-            raise Trouble(f"GRBL raised {line} ({ALARM_WORDS.get(line[6:], 'unknown')}); clear the cause, home")
-        if line.startswith("error:"):
-            if self._unacknowledged:
-                self._unacknowledged.popleft()
-            words = ERROR_WORDS.get(line[6:], "unknown")
-            raise Trouble(f"GRBL refused a command with {line} ({words}); compare its $$ with the config")
-        if "Grbl" in line or "GrblHAL" in line:
-            if not self._resetting:
-                raise Trouble("the board restarted by itself (its banner came); check its supply, then home")
-            self._resetting = False
-            self._asking.forget()
-
-    def _take_status(self, status: Status, begun: int, *, fuse: bool) -> LensReport | None:
-        if not self._asking.open:
-            return None  # late or duplicate: its instant of sampling is unknown
-        self._asking.answered()
-        if status.state == "Alarm" and self._busy() and not self._locked_by_stop and not self._unacknowledged:
-            raise Trouble("GRBL fell into Alarm during a motion; clear the cause, home")
-        moving = status.state in {"Jog", "Run", "Home", "Hold:1"}
-        velocity = None if moving else 0.0
-        earliest = self._sampled_from_ns
-        report = LensReport(
-            (status.x_mm + self._travel_mm) * self._steps_per_mm,
-            HostNs(earliest),
-            HostNs(max(begun, earliest)),
-            velocity,
-            LensFlag.MOVING if moving else LensFlag.NONE,
-        )
-        self._motor.replies_are_held(self._asking.held_ns)
-        if fuse and not self._motor.believes(report):
-            self._asking.soon()
-            return None
-        self._asking.believed()
-        self._status, self._motor.report = status, report
-        self._watch_motion(report)
-        return report
-
-    def _watch_motion(self, report: LensReport) -> None:
-        """Believe in rest when it is reported; stop again, harder each time, what should be at rest by now."""
-        motor = self._motor
-        if motor.rest_due_ns is None:
-            return
-        planned = motor.planned_rest_ns
-        if not report.moving and not self._unacknowledged and (planned is None or report.earliest_ns > planned):
-            motor.at_rest()
-            self._stopping = False
-        elif motor.overdue(report):
-            if motor.stops_ignored > STOPS_TRIED:
-                raise Trouble(f"the motor still runs after {STOPS_TRIED} stops; the board was reset")
-            self._line.send(CANCEL)
-            self._stopping = True
+    # --- below: how it is done -------------------------------------------------------------------------------------
 
     def _flagged(self, report: LensReport) -> LensReport:
         flags = LensFlag.NONE
-        if self._status is not None and "X" in self._status.pins:
+        if self._talk.status is not None and "X" in self._talk.status.pins:
             flags |= LensFlag.LIMIT
-        if self._status is not None and self._status.state == "Alarm":
+        if self._talk.status is not None and self._talk.status.state == "Alarm":
             flags |= LensFlag.ALARM
         return self._motor.flagged(report, flags)
 
-    def _new_motor(self) -> Motor:
+    def _new_motor(self, steps_per_mm: float = 0.0) -> Motor:
         sigma_ns = round(self._settings.latency_sigma_us * NS_PER_US)
-        quantum = 0.001 * self._steps_per_mm
+        quantum = 0.001 * steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
-        timing = Timing(reply_ns, sigma_ns, sigma_ns // 2, quantum, rest_quantum_steps=quantum, ramp_steps=1.5)
+        timing = Timing(
+            reply_ns,
+            sigma_ns,
+            sigma_ns // 2,
+            quantum,
+            rest_quantum_steps=quantum,
+            ramp_steps=RAMP_STEPS,
+            pace_sigma=PACE_SIGMA,
+        )
         return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=0.3)
 
     def _wait(self, deadline: HostNs, why: str) -> None:

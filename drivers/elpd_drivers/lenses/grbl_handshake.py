@@ -14,7 +14,7 @@ from elpd.errors import ConfigError, LensError
 from elpd.units import after_ms
 from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US, Dialect, dialect_of
-from elpd_drivers.lenses.grbl_lines import CANCEL, RESET, STATUS, Status, parse_status
+from elpd_drivers.lenses.grbl_lines import CANCEL, FULL_STATUS, RESET, STATUS, Status, parse_status
 from elpd_drivers.lenses.lines import LineReader
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ class GrblLensSettings:
 class BoardFacts:
     """What the board says about itself.
 
-    ``homed``: by this driver, and not reset since. ``restarted``: its banner came while it was looked at.
+    ``homed``: by this driver or by what the board says, and not reset since. ``home`` is the line that homes it.
+    ``restarted``: its banner came while it was looked at.
     """
 
     limits: LensLimits
@@ -68,6 +69,7 @@ class BoardFacts:
     homed: bool
     restarted: bool
     dialect: Dialect
+    home: bytes
 
 
 def handshake(line: Line, clock: Clock, settings: GrblLensSettings) -> BoardFacts:
@@ -106,10 +108,15 @@ class _Handshake:
                 f"board says {' '.join(version)[:80]!r}; update its firmware, or choose another lens.driver"
             )
         board = self._numbers(self._ask("$$", "$"))
-        limits = _agreed_limits(board, self._settings)
+        limits = _agreed_limits(board, self._settings, dialect)
+        if status.state == "Alarm" and dialect.reset_after_alarm:
+            status = self._reset()
         idle = status.state == "Idle"
         homed = idle and dialect.remembers and self._tool() == HOMED_BY_US
-        return BoardFacts(limits, board[100], board[130], idle, homed, self._restarted, dialect)
+        if idle and dialect.tells_homed:
+            homed = self._status(FULL_STATUS).homed
+        home = dialect.home_line(board.get(22, 0.0))
+        return BoardFacts(limits, board[100], board[130], idle, homed, self._restarted, dialect, home)
 
     def _tool(self) -> int | None:
         """Return the number of the tool that the board thinks it holds."""
@@ -119,7 +126,24 @@ class _Handshake:
                 return int(tool[1])
         return None
 
-    def _status(self) -> Status:
+    def _reset(self) -> Status:
+        """Reset a board that is locked, and so has no position to lose; return its status after the banner."""
+        self._restarted = False
+        self._line.send(RESET)
+        due = after_ms(self._clock.now_ns(), self._settings.connect_ms)
+        while not self._restarted:
+            for line, _ in self._lines.feed(self._line.read()):
+                self._restarted = self._restarted or _is_banner(line)
+            now = self._clock.now_ns()
+            if now >= due:
+                raise LensError(
+                    f"lens port {self._line.name}: no banner within {self._settings.connect_ms:.0f} ms of a reset; "
+                    "switch the board off and on"
+                )
+            self._clock.sleep_until(after_ms(now, 1))
+        return self._status()
+
+    def _status(self, question: bytes = STATUS) -> Status:
         """Wait for a status report; a board that says nothing may be dead after an alarm, or booting."""
         start = self._clock.now_ns()
         due = after_ms(start, self._settings.connect_ms)
@@ -136,13 +160,13 @@ class _Handshake:
                 self._line.send(RESET)
                 self._restarted, reset_at = True, due
             if now >= ask_at:
-                self._line.send(STATUS)
+                self._line.send(question)
                 ask_at = after_ms(now, 100)
             for line, _ in self._lines.feed(self._line.read()):
                 status = parse_status(line)
                 if status is not None:
                     return status
-                self._restarted = self._restarted or "Grbl" in line
+                self._restarted = self._restarted or _is_banner(line)
                 seen = (seen + line)[-80:]
             self._clock.sleep_until(after_ms(now, 1))
 
@@ -183,7 +207,11 @@ class _Handshake:
         return board
 
 
-def _agreed_limits(board: dict[int, float], settings: GrblLensSettings) -> LensLimits:
+def _is_banner(line: str) -> bool:
+    return line.startswith("Grbl")
+
+
+def _agreed_limits(board: dict[int, float], settings: GrblLensSettings, dialect: Dialect) -> LensLimits:
     """Take travel, speed and acceleration from the board and the config; refuse contradictions."""
     per_mm, travel_um, speed_um_s = board[100], board[130] * 1000, board[110] / 60 * 1000
     if abs(per_mm * settings.um_per_step / 1000 - 1) > 1e-3:
@@ -196,7 +224,12 @@ def _agreed_limits(board: dict[int, float], settings: GrblLensSettings) -> LensL
     for name, wanted, number, has in (("max_um", max_um, 130, travel_um), ("max_speed_um_s", speed, 110, speed_um_s)):
         if wanted > has * (1 + 1e-6):
             raise ConfigError(f"lens.{name} is {wanted:g}, the board's ${number} allows {has:g}; change one of them")
-    min_um, max_um = _beside_the_switch(board, settings.min_um, max_um)
+    if int(board.get(22, 0.0)) & dialect.origin_flag:
+        raise ConfigError(
+            f"the board's $22 is {board[22]:g} and makes the place of homing its zero; this driver counts from the end "
+            f"of the travel ($130): set $22={int(board[22]) & ~dialect.origin_flag}, and home"
+        )
+    min_um, max_um = _beside_the_switches(board, dialect, settings.min_um, max_um)
     acceleration = board[120] * 1000
     if settings.acceleration_um_s2 is not None and abs(settings.acceleration_um_s2 / acceleration - 1) > 1e-3:
         raise ConfigError(
@@ -206,14 +239,16 @@ def _agreed_limits(board: dict[int, float], settings: GrblLensSettings) -> LensL
     return limits_from(1000 / per_mm, min_um, max_um, speed, acceleration)
 
 
-def _beside_the_switch(board: dict[int, float], min_um: float, max_um: float) -> tuple[float, float]:
-    """Keep half the pull-off from the end that was homed on: GRBL counts to the very step that closed its switch.
+def _beside_the_switches(
+    board: dict[int, float], dialect: Dialect, min_um: float, max_um: float
+) -> tuple[float, float]:
+    """Keep away from switches that are hard limits too by as much of the pull-off as the firmware asks for.
 
-    Where that switch is a hard limit too, going there is an alarm.
+    GRBL allows to go to the very step that closed the homing switch, where an alarm waits: half of it is spared.
     """
-    if not (board.get(21) and board.get(22)):
+    if not (int(board.get(21, 0.0)) & 1 and int(board.get(22, 0.0)) & 1):
         return min_um, max_um
-    away_um = board.get(27, 0.0) * 1000 / 2
-    if int(board.get(23, 0.0)) & 1:
-        return max(min_um, away_um), max_um
-    return min_um, min(max_um, board[130] * 1000 - away_um)
+    homed_um, other_um = (share * board.get(27, 0.0) * 1000 for share in dialect.spare)
+    upwards = not int(board.get(23, 0.0)) & 1
+    low_um, high_um = (other_um, homed_um) if upwards else (homed_um, other_um)
+    return max(min_um, low_um), min(max_um, board[130] * 1000 - high_um)

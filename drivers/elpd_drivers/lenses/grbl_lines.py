@@ -6,6 +6,9 @@ import re
 from dataclasses import dataclass
 
 STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
+FULL_STATUS = b"\x87"
+"""Asks for a report with every field that there is; grblHAL knows it, GRBL takes it as a letter."""
+
 ERROR_WORDS = {
     "1": "expected a letter",
     "2": "bad number",
@@ -14,6 +17,7 @@ ERROR_WORDS = {
     "5": "homing is off, $22=0",
     "8": "not idle",
     "9": "locked",
+    "7": "settings could not be read",
     "15": "beyond the travel",
     "16": "invalid jog",
     "20": "unsupported",
@@ -35,18 +39,20 @@ OUTPUTS = {
 }
 """What switches an output on and off. The iris is Kurokesu's SCE2's; other boards refuse it (error 20)."""
 
-_STATE = re.compile(r"<(Idle|Jog|Run|Hold:[01]|Alarm|Home|Door:[0-3]|Check|Sleep)\|")
+_STATE = re.compile(r"<(Idle|Jog|Run|Hold:[01]|Alarm|Home|Door:[0-4]|Check|Sleep|Tool)(?::\d+)?\|")
 _POSITION = re.compile(r"\|MPos:(-?\d+\.\d{3,4}),[-\d.,]+[|>]")
+_HOMED = re.compile(r"\|H:1[,|>]")
 _PINS = re.compile(r"\|Pn:([A-Z]+)[|>]")
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a status report says."""
+    """What a status report says; ``homed`` where it has a field for that. A code behind the state is left out."""
 
     state: str
     x_mm: float
     pins: str = ""
+    homed: bool = False
 
 
 def parse_status(line: str) -> Status | None:
@@ -56,7 +62,7 @@ def parse_status(line: str) -> Status | None:
     state, position, pins = _STATE.match(line), _POSITION.search(line), _PINS.search(line)
     if state is None or position is None:
         return None
-    return Status(state[1], float(position[1]), pins[1] if pins else "")
+    return Status(state[1], float(position[1]), pins[1] if pins else "", _HOMED.search(line) is not None)
 
 
 def jog_line(x_mm: float, feed_mm_min: float) -> bytes:

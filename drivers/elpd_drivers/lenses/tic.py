@@ -112,6 +112,8 @@ class TicController:
         self._newest = wire.TicReply(0, 0.0, 0, 0)
         self._status = self._errors = 0
         self._halted_softly = False
+        self._told_home_ns: int | None = None
+        self._newest_from_ns = 0
         self._speed_sps = 0.0
 
     @property
@@ -246,11 +248,42 @@ class TicController:
         """Run to the reverse limit switch; position 0 is where it lets go."""
         self._prepare()
         self._halted_softly = False
-        self._line.send(self._frame(wire.EXIT_SAFE_START) + self._frame(wire.GO_HOME, b"\0"))
+        self._told_home_ns = self._line.send(
+            self._frame(wire.EXIT_SAFE_START) + self._frame(wire.GO_HOME, b"\0")
+        ).off_wire_ns
 
     def homing(self) -> bool:
-        """Whether the Tic says that it is homing."""
-        return bool(self._status & wire.HOMING)
+        """Whether the Tic says that it is homing, or has homed since it was looked at last.
+
+        A Tic that begins on its switch, or beside it, may be done between two looks. Then it stands at 0, is certain of
+        it, and has made a step since it was told to home.
+        """
+        if self._status & wire.HOMING:
+            self._told_home_ns = None
+            return True
+        told_ns, newest = self._told_home_ns, self._newest
+        if (
+            told_ns is None
+            or self._newest_from_ns < told_ns
+            or self._status & wire.UNCERTAIN
+            or newest.position != 0
+            or newest.velocity_sps != 0.0
+        ):
+            return False
+        self._settle()
+        since_ns = int.from_bytes(self._ask_for(*wire.SINCE_LAST_STEP), "little") * 1000 // wire.SINCE_PER_US
+        if self._line.by_ns - since_ns < told_ns:
+            return False
+        self._told_home_ns = None
+        return True
+
+    def _settle(self) -> None:
+        """Let the reply that is under way arrive, and leave it: another question follows."""
+        due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
+        while self.asking.open and len(self._received) < self._reply_length and self._line.looked_ns < due:
+            self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
+            self._received += self._line.read()
+        self.asking.forget()
 
     def end_homing(self) -> None:
         """See that the position is certain."""
@@ -276,7 +309,7 @@ class TicController:
         # it homes at speeds of its own settings
         if reply is None or (abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps and not reply.flags & wire.HOMING):
             return None  # the silence limit counts on; the next query resynchronises
-        self._newest = reply
+        self._newest, self._newest_from_ns = reply, self._sampled_from_ns
         velocity = reply.velocity_sps
         at_switch = bool(reply.flags & (wire.FORWARD_LIMIT | wire.REVERSE_LIMIT))
         # a moving motor is half a step beyond the last one that it made, on average

@@ -24,6 +24,7 @@ from elpd_drivers.lenses import zaber_wire as wire
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.direct import DirectLens, Going, Latency, Reading
+from elpd_drivers.lenses.iris_axis import IRIS, iris_axis
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
+    from elpd_drivers.lenses.iris_axis import IrisAxis
     from elpd_drivers.lenses.line import Line, Sent
 
 IDENTIFICATIONS = 3
@@ -45,7 +47,9 @@ OUTPUTS = ("do1", "do2", "do3", "do4")
 class ZaberSettings:
     """The table ``[lens]`` for a Zaber device. What it knows (travel, speed, acceleration) is read from it.
 
-    ``device`` is its address in the chain, ``axis`` the motor. ``max_um``, ``max_speed_um_s`` and
+    ``device`` is its address in the chain, ``axis`` the motor. With ``iris_axis`` another of the device's axes turns a
+    stepper iris, which is the output "iris" then: between ``iris_closed`` and ``iris_open`` (microsteps from that
+    axis's home, which is at the closed end) at ``iris_speed_sps``. ``max_um``, ``max_speed_um_s`` and
     ``acceleration_um_s2`` need not be given; a limit must lie inside the device's own, an acceleration agree with it.
     ``latency_us`` is the usual time from a command's last bit to its effect, adapter included, and
     ``latency_sigma_us`` how well that is known; unless given, a real port gets what USB adapters need.
@@ -64,6 +68,10 @@ class ZaberSettings:
     reply_ms: float = 60.0
     latency_us: float = 300.0
     latency_sigma_us: float = 120.0
+    iris_axis: int = 0
+    iris_closed: int = 0
+    iris_open: int = 0
+    iris_speed_sps: float = 0.0
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> DirectLens:
@@ -106,6 +114,8 @@ class ZaberController:
         self._asked_off_ns = 0
         self._orders: set[int] = set()
         self._busy = self._referenced = False
+        self._iris = iris_axis(settings, settings.axis)
+        self._iris_referenced = False
 
     @property
     def trouble_bytes(self) -> bytes:
@@ -139,6 +149,8 @@ class ZaberController:
         self._refuse_faults(reply.flag)
         self._referenced = reply.flag not in wire.NOT_REFERENCED
         self.limits = self._agreed_limits()
+        if self._iris is not None:
+            self._meet_iris(self._iris)
 
     def referenced(self) -> bool:
         """Whether the device says that its position is referenced."""
@@ -216,10 +228,11 @@ class ZaberController:
         self._numbers = (self._numbers + 1) % 100
         return self._numbers
 
-    def _exchange(self, words: str) -> wire.Reply:
+    def _exchange(self, words: str, axis: int | None = None) -> wire.Reply:
         """Send a command and wait for its reply. Raises ``Trouble`` if it is refused or lost."""
         number = self._next_number()
-        self._line.send(self._frame(words, number))
+        axis = self._settings.axis if axis is None else axis
+        self._line.send(wire.command(self._settings.device, axis, words, number))
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
         seen = ""
         while True:
@@ -236,9 +249,10 @@ class ZaberController:
             self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
 
     def _ours(self, line: str) -> wire.Reply | None:
-        """Read a line that is this axis's; once a reply had a checksum, all must."""
+        """Read a line that is this lens's, or its iris's; once a reply had a checksum, all must."""
         reply = wire.parse_reply(line, checked_only=self._checked_only)
-        if reply is None or reply.device != self._settings.device or reply.axis not in {0, self._settings.axis}:
+        ours = {0, self._settings.axis, self._settings.iris_axis}
+        if reply is None or reply.device != self._settings.device or reply.axis not in ours:
             return None
         self._checked_only = self._checked_only or (reply.checked and reply.number is not None)
         return reply
@@ -248,10 +262,11 @@ class ZaberController:
             words = wire.REJECTIONS.get(reply.data, "see its manual")
             raise Trouble(f"the device refused a command with {reply.data} ({words}), flag {reply.flag}; home it again")
 
-    def _refuse_faults(self, flag: str) -> None:
+    def _refuse_faults(self, flag: str, axis: int = 0) -> None:
         if flag.startswith("F"):
             words = wire.FAULT_WORDS.get(flag, "a fault")
-            raise Trouble(f"the device stopped itself: {words} (flag {flag}); remove the cause, home")
+            what = "the iris's axis" if self._iris is not None and axis == self._iris.axis else "the device"
+            raise Trouble(f"{what} stopped itself: {words} (flag {flag}); remove the cause, home")
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
@@ -277,15 +292,52 @@ class ZaberController:
 
     @property
     def outputs(self) -> Sequence[str]:
-        """The digital outputs; a device without them, or with fewer, refuses."""
-        return OUTPUTS
+        """The digital outputs, and an iris on another axis; a device without outputs, or with fewer, refuses."""
+        return OUTPUTS if self._iris is None else (IRIS, *OUTPUTS)
 
     def switch(self, name: str, *, on: bool) -> Sent:
-        """Switch a digital output of the device: one command, whose reply ``read`` looks at."""
+        """Switch a digital output, or send the iris on its way: one command, whose reply ``read`` looks at."""
+        if self._iris is not None and name == IRIS:
+            return self._turn_iris(self._iris, opened=on)
+        return self._order(0, f"io set do {name.removeprefix('do')} {int(on)}")
+
+    def _order(self, axis: int, words: str) -> Sent:
         number = self._next_number()
         self._orders.add(number)
-        words = f"io set do {name.removeprefix('do')} {int(on)}"
-        return self._line.send(wire.command(self._settings.device, 0, words, number))
+        return self._line.send(wire.command(self._settings.device, axis, words, number))
+
+    def _meet_iris(self, iris: IrisAxis) -> None:
+        """See that the iris's axis is there, can reach both places, and whether it knows where it is."""
+        low, high = (self._iris_number(iris, f"limit.{end}") for end in ("min", "max"))
+        for name, steps in (("iris_closed", iris.closed_steps), ("iris_open", iris.open_steps)):
+            if not low <= steps <= high:
+                raise ConfigError(
+                    f"lens.{name} is {steps}, axis {iris.axis} of the device goes from {low:g} to {high:g}; "
+                    "change one of them"
+                )
+        fastest_sps = self._iris_number(iris, "maxspeed") / wire.SPEED_PER_SPS
+        if iris.speed_sps > fastest_sps * (1 + 1e-6):
+            raise ConfigError(
+                f"lens.iris_speed_sps is {iris.speed_sps:g}, axis {iris.axis} of the device makes {fastest_sps:.0f} "
+                "at the most (its maxspeed); change one of them"
+            )
+
+    def _iris_number(self, iris: IrisAxis, setting: str) -> float:
+        reply = self._exchange(f"get {setting}", axis=iris.axis)
+        self._iris_referenced = reply.flag not in wire.NOT_REFERENCED
+        return float(reply.data)
+
+    def _turn_iris(self, iris: IrisAxis, *, opened: bool) -> Sent:
+        """Open or close it. The first closing since power-up is the homing of its axis, to its closed end."""
+        if not self._iris_referenced:
+            if opened:
+                raise LensError(
+                    f"lens: axis {iris.axis} does not know where the iris is; close it first, that homes it"
+                )
+            self._iris_referenced = True
+            return self._order(iris.axis, "home")
+        units = max(1, math.floor(iris.speed_sps * wire.SPEED_PER_SPS + 1e-6))
+        return self._order(iris.axis, f"move abs {iris.target(opened=opened)} {units}")
 
     # --- homing ----------------------------------------------------------------------------------------------------
 
@@ -321,7 +373,7 @@ class ZaberController:
             reply = self._ours(line)
             if reply is None:
                 continue
-            self._refuse_faults(reply.flag)
+            self._refuse_faults(reply.flag, reply.axis)
             if reply.number is not None and reply.number == self._question:
                 latest_ns = self._line.by_ns - (len(line) + 2 + behind) * self._line.byte_ns
                 reading = self._position(reply, latest_ns) or reading

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from elpd_drivers.sim.aperture import SimulatedAperture
+    from elpd_drivers.sim.aperture import Opening
     from elpd_drivers.sim.motion import SceneMotion
 
 LAMP_SHAPES = ("sine", "pwm")
@@ -238,7 +238,7 @@ class LightField:
         focus_um: float,
         motion: SceneMotion,
         *,
-        aperture: SimulatedAperture | None,
+        aperture: Opening | None,
         depth_of_focus_um: float,
         margin_px: int,
         lamp: Lamp | None = None,

@@ -12,18 +12,20 @@ play for an upward sweep, minus half for a downward one. The final error is read
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from elpd.errors import ConfigError, LensError
 from elpd.events.evt3_encode import Evt3Encoder
+from elpd.motion.lens_output import aperture_on_lens
 from elpd.ports import RigParts
 from elpd.records import Encoding, Geometry, LensReport, Roi, Trigger
 from elpd.scale import LensScale
 from elpd.units import Steps, after_ms
 from elpd_drivers.lenses.axis import read_settings
-from elpd_drivers.sim.aperture import SimulatedAperture
+from elpd_drivers.lenses.iris_axis import IRIS
+from elpd_drivers.sim.aperture import Opening, SimulatedAperture, StepperIris
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, TriggerLine, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
 from elpd_drivers.sim.drift import Drift
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from elpd.motion.lens_output import LensOutputAperture
     from elpd.ports import Lens
     from elpd.records import FocusResult
     from elpd_drivers.sim.boards.line import MemoryPort
@@ -65,8 +68,10 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in. Focus moves along the travel by ``drift_um_s``. With ``sync_steps`` the board's sync line, which makes
-    an edge at every multiple of so many steps, is wired to the camera's trigger input, unless ``sync_cut``.
+    believes in. With ``iris_steps`` the aperture is an iris on the second axis of the lens's board (Zaber's), with so
+    many microsteps from stop to stop, turned at ``iris_speed_sps``. Focus moves along the travel by ``drift_um_s``.
+    With ``sync_steps`` the board's sync line, which makes an edge at every multiple of so many steps, is wired to the
+    camera's trigger input, unless ``sync_cut``.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -119,6 +124,8 @@ class SimSettings:
     aperture_profile: str = "iris"
     aperture_stuck: bool = False
     aperture_slow: bool = False
+    iris_steps: int = 0
+    iris_speed_sps: float = 12_800.0
     # lens
     travel_um: float = 2500.0
     um_per_step: float = 0.3125
@@ -135,6 +142,18 @@ class SimSettings:
     camera_silent_from_s: float | None = None
     drop_from_s: float | None = None
     drop_for_s: float = 0.01
+
+
+IRIS_HOMING_MS, IRIS_SPARE_MS = 500.0, 20.0
+
+
+@runtime_checkable
+class TurnsIris(Protocol):
+    """A board with an axis for an iris."""
+
+    def add_iris(self, iris: StepperIris) -> None:
+        """Put it there."""
+        ...
 
 
 class Evt3Wire:
@@ -190,7 +209,7 @@ class SimulatedTruth:
         lens: Lens,
         mechanism: SimulatedLens,
         port: MemoryPort,
-        aperture: SimulatedAperture | None,
+        aperture: Opening | None,
         focus_carriage_um: float,
         scene: str,
         light: LightField,
@@ -274,8 +293,9 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     focus_um, start_um = _place(chosen)
     mechanism = SimulatedLens(_mechanics(chosen), start_um=start_um)
     drift = Drift(BIRTH_NS, chosen.drift_um_s)
-    lens, port = _lens(chosen, world, mechanism)
-    aperture = _aperture(chosen, world) if chosen.camera == "evk4" else None
+    iris = StepperIris(chosen.iris_steps) if chosen.iris_steps else None
+    lens, port = _lens(chosen, world, mechanism, iris)
+    aperture = _aperture(chosen, world) if chosen.camera == "evk4" and iris is None else None
     scene = choose_scene(chosen.scene, random_stream(seed, "scene"))
     stack = _stack(scene, geometry, chosen.brightness)
     heading = np.deg2rad(chosen.pan_deg)
@@ -285,7 +305,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         lambda times_ns: cam.image_um(mechanism.carriage_um(times_ns)) - drift.um(times_ns),
         float(cam.image_um(np.float64(focus_um))),
         SceneMotion(chosen.motion, random_stream(seed, "motion"), MARGIN_PX - INTERPOLATION_PX, pan_px_s),
-        aperture=aperture,
+        aperture=iris or aperture,
         depth_of_focus_um=chosen.depth_of_focus_um,
         margin_px=MARGIN_PX,
         lamp=Lamp(chosen.flicker_hz, chosen.flicker_depth, chosen.flicker_shape),
@@ -298,7 +318,7 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
         lens=lens,
         mechanism=mechanism,
         port=port,
-        aperture=aperture,
+        aperture=iris or aperture,
         focus_carriage_um=focus_um,
         scene=scene,
         light=light,
@@ -309,7 +329,8 @@ def build_rig(settings: Mapping[str, Any]) -> RigParts:
     )
     wired = chosen.sync_steps and not chosen.sync_cut
     line = port.wire.board if wired and isinstance(port.wire.board, TriggerLine) else None
-    return RigParts(world, _camera(chosen, world, light, geometry, line), lens, aperture, scale, truth)
+    opener = aperture if iris is None else _iris_on(lens, chosen)
+    return RigParts(world, _camera(chosen, world, light, geometry, line), lens, opener, scale, truth)
 
 
 def _stack(scene: str, geometry: Geometry, brightness: float) -> DefocusStack:
@@ -383,7 +404,9 @@ def _mechanics(chosen: SimSettings) -> LensMechanics:
     )
 
 
-def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[Lens, MemoryPort]:
+def _lens(
+    chosen: SimSettings, world: World, mechanism: SimulatedLens, iris: StepperIris | None
+) -> tuple[Lens, MemoryPort]:
     wanted = Wanted(chosen.um_per_step, chosen.travel_um, 3 * chosen.speed_um_s, chosen.acceleration_um_s2)
     port, table = fitted(chosen.board, mechanism, wanted, world, seed=chosen.seed)
     world.add(port)
@@ -391,6 +414,13 @@ def _lens(chosen: SimSettings, world: World, mechanism: SimulatedLens) -> tuple[
         if not isinstance(port.wire.board, TriggerLine):
             raise ConfigError(f"sim.sync_steps: the board {chosen.board!r} has no sync line; sim.board=avr has")
         table = {**table, "sync_steps": chosen.sync_steps}
+    if iris is not None:
+        if not isinstance(port.wire.board, TurnsIris):
+            raise ConfigError(
+                f"sim.iris_steps: the board {chosen.board!r} has no second axis here; sim.board=zaber has"
+            )
+        port.wire.board.add_iris(iris)
+        table = {**table, "iris_axis": 2, "iris_open": chosen.iris_steps, "iris_speed_sps": chosen.iris_speed_sps}
     lens = controller(chosen.board).open_lens(table, world, port)
     if not lens.capabilities.stop_on_command:  # nor does such a controller remember where it is: as a person would
         here = Steps(round(mechanism.rotor_at(world.now_ns())))
@@ -417,6 +447,13 @@ def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
         profile=chosen.aperture_profile,
         fault="stuck" if chosen.aperture_stuck else "slow" if chosen.aperture_slow else None,
     )
+
+
+def _iris_on(lens: Lens, chosen: SimSettings) -> LensOutputAperture:
+    """Return the iris as whoever owns the rig would describe it: so long it takes from stop to stop, at the most."""
+    way_ms = 1000.0 * chosen.iris_steps / chosen.iris_speed_sps
+    table = {"output": IRIS, "opening_ms": max(way_ms, IRIS_HOMING_MS) + IRIS_SPARE_MS}
+    return aperture_on_lens(table, lens)
 
 
 def _camera(

@@ -22,6 +22,8 @@ export function mountPicture(store) {
   let asking = false;
   let again = false;
   let known; // the daemon's region; undefined: not asked yet
+  let told; // the region in the status before
+  let sent = 0; // changes of this page's; an answer to an older one than the last says nothing of the region
   let named = {};
   let wasLive = false;
   let lastResult = null;
@@ -78,15 +80,16 @@ export function mountPicture(store) {
 
   async function setRegion(box, name) {
     typing = false;
+    const mine = ++sent;
     try {
       const answer = await command("roi", { set: box, ...(name ? { name } : {}) });
-      if (!name) {
+      if (!name && mine === sent) {
         const used = answer.roi;
         if (used !== null && !same(used, box)) echo(`Cut to the sensor: ${text(used)}.`);
         else echo("");
         speak(used === null ? "elpd chooses the region" : `Region ${text(used)}`);
       }
-      takeRegions(answer);
+      takeRegions(answer, mine);
     } catch (error) {
       trouble(error.message);
       editor.set(known ?? null);
@@ -97,10 +100,12 @@ export function mountPicture(store) {
     say($("roi-echo"), text);
   }
 
-  function takeRegions(answer) {
-    known = answer.roi;
+  function takeRegions(answer, asked) {
+    if (asked === sent) {
+      known = answer.roi;
+      editor.set(known);
+    }
     named = answer.named;
-    editor.set(known);
     const options = Object.keys(named).map((name) => make("option", { value: name, textContent: name }));
     $("roi-named").replaceChildren(make("option", { value: "", textContent: options.length ? "choose…" : "none" }), ...options);
     $("roi-named").disabled = options.length === 0;
@@ -143,7 +148,8 @@ export function mountPicture(store) {
   store.listen((state) => {
     const now = live(state);
     if (now && !wasLive) {
-      ask("roi").then(takeRegions, (error) => trouble(error.message));
+      const before = sent;
+      ask("roi").then((answer) => takeRegions(answer, before), (error) => trouble(error.message));
       refresh();
     }
     wasLive = now;
@@ -154,10 +160,12 @@ export function mountPicture(store) {
     $("download").disabled = !now || !shown;
     show($("kind-frame"), Boolean(state.status?.camera.has_frames));
     const region = state.status?.roi;
-    if (region !== undefined && known !== undefined && !same(region, known)) {
-      known = region; // somebody else set it
+    const news = told === undefined ? sent === 0 : !same(region, told);
+    if (region !== undefined && known !== undefined && news && !same(region, known)) {
+      known = region; // somebody else set it; a status that is late says what it said before
       editor.set(known);
     }
+    told = region;
     const result = state.cycle?.result ?? null;
     const mapMade = Boolean(state.cycle?.seen.includes("probe"));
     if ((result && result !== lastResult) || (mapMade && !wasMade)) refresh();

@@ -22,14 +22,18 @@ PARAMETERS = (
 BAD_NUMBER, BAD_STATEMENT, NEGATIVE, HOMING_OFF, NOT_IDLE, LOCKED = 2, 3, 4, 5, 8, 9
 EXPECTED_LETTER, SOFT_NEEDS_HOMING, LINE_TOO_LONG, BEYOND_TRAVEL, BAD_JOG = 1, 10, 11, 15, 16
 UNSUPPORTED, NO_FEED = 20, 22
+NOT_IN_ALARM = 79
 
 
 @dataclass(frozen=True, slots=True)
 class Firmware:
     """What one firmware of the family says and does.
 
-    ``prepared`` is how many segments of 10 ms run before a stop bites, ``one_axis_homing`` whether ``$HX`` is known,
-    and ``tells_homing`` whether status is reported while homing (GRBL's own cycle answers nothing until it is over).
+    ``prepared`` is how many segments of 10 ms run before a stop bites, ``one_axis_homing`` whether ``$HX`` is known
+    (and ``one_axis_flag`` the flag of ``$22`` that it needs), ``tells_homing`` whether status is reported while homing
+    (GRBL's own cycle answers nothing until it is over). With ``tells_homed`` a full report (0x87) says whether the axis
+    is homed. With ``hears_in_alarm`` the firmware answers after a hard limit, and with the alarm's number, though it
+    allows nothing before a reset; it sleeps over no alarm. ``has_iris``: M114 switches one.
     """
 
     greeting: str
@@ -38,6 +42,10 @@ class Firmware:
     prepared: int = 5
     one_axis_homing: bool = True
     tells_homing: bool = False
+    one_axis_flag: int = 0
+    tells_homed: bool = False
+    hears_in_alarm: bool = False
+    has_iris: bool = False
 
 
 FIRMWARES = {
@@ -45,7 +53,11 @@ FIRMWARES = {
     "grblhal": Firmware(
         "\r\nGrblHAL 1.1f ['$' or '$HELP' for help]",
         ("[VER:1.1f.20240815:]", "[OPT:VNMSL,100,1024,3,0]", "[FIRMWARE:grblHAL]", "[DRIVER:iMXRT1062]"),
+        prepared=2,
         tells_homing=True,
+        one_axis_flag=2,
+        tells_homed=True,
+        hears_in_alarm=True,
     ),
     "fluidnc": Firmware(
         "\r\nGrbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]",
@@ -56,9 +68,13 @@ FIRMWARES = {
         "\r\nGrbl 1.1f-SCE2 ['$' for help]",
         ("[VER:1.1f-SCE2.20211130:L086,6ZG-BEG19]", "[OPT:V,15,254]"),
         axes=4,
+        has_iris=True,
         prepared=10,
     ),
 }
+
+
+SCE2_OUTPUT_WORDS = {"M114P1": ("iris", True), "M114P0": ("iris", False)}
 
 
 class GrblError(Exception):
@@ -188,6 +204,7 @@ def status_report(
     wco: bool = False,
     overrides: bool = False,
     axes: int = 3,
+    homed: bool | None = None,
 ) -> str:
     """Return a status report with machine position, in GRBL's field order."""
     others = ",0.000" * (axes - 1)
@@ -198,6 +215,8 @@ def status_report(
         fields.append(f"WCO:0.000{others}")
     elif overrides:
         fields.append("Ov:100,100,100")
+    if homed is not None:
+        fields.append(f"H:{int(homed)},{int(homed)}")
     return f"<{'|'.join(fields)}>"
 
 

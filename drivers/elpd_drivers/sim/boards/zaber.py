@@ -1,4 +1,4 @@
-"""A Zaber device (firmware 7, ASCII protocol) with one axis, in front of a simulated lens.
+"""A Zaber device (firmware 7, ASCII protocol) in front of a simulated lens; a second axis may turn an iris.
 
 What matters to whoever drives one: every message may carry a number and a checksum, a wrong checksum is silence;
 replies say whether the axis is busy and the most serious warning there is; after power-up the axis has no reference
@@ -20,10 +20,14 @@ from elpd_drivers.sim.boards.axis import Axis, Happened, Search
 from elpd_drivers.sim.boards.served import ServedBoard
 
 if TYPE_CHECKING:
+    from elpd_drivers.sim.aperture import StepperIris
     from elpd_drivers.sim.lens import SimulatedLens
 
 SPEED_UNIT, ACCELERATION_UNIT = 1.6384, 1.6384e-4
 LINE_LENGTH = 80
+IRIS_AXIS = 2
+HOMING_S = 0.5
+"""How long an iris takes for its whole way while it is homed."""
 SEVERITY = ("FM", "FO", "WL", "WR", "WH", "NI")
 
 
@@ -78,6 +82,10 @@ class ZaberBoard:
         self._partial = bytearray()
         self._output: list[tuple[int, bytes]] = []
         self._flags: set[str] = set()
+        self.iris: StepperIris | None = None
+        """What axis 2 turns, if there is one."""
+        self._iris_flags: set[str] = {"WR", "WH"}
+        self._iris_rest_ns = begin_ns
         self.outputs: dict[str, bool] = {}
         """The digital outputs that were switched, by name: for tests."""
         self._settings: dict[str, float | str] = {}
@@ -97,6 +105,11 @@ class ZaberBoard:
                     self._agenda.queue(at_ns + latency_ns, partial(self._take_line, line))
             elif len(self._partial) < 2 * LINE_LENGTH:
                 self._partial.append(byte)
+
+    def add_iris(self, iris: StepperIris) -> None:
+        """Put an iris on axis 2."""
+        self.iris = iris
+        self._settings["system.axiscount"] = 2
 
     def advance_to(self, when_ns: int) -> None:
         """Let pending commands and the limit sensors happen, in the order of their times."""
@@ -142,13 +155,17 @@ class ZaberBoard:
         if device not in {0, self.config.device}:
             return
         try:
-            if axis not in {0, 1}:
+            if axis == IRIS_AXIS and self.iris is not None:
+                data, verdict = self._obey_iris(self.iris, words, at_ns), "OK"
+            elif axis not in {0, 1}:
                 raise RefusedError("BADAXIS")
-            data, verdict = self._obey(words, at_ns), "OK"
+            else:
+                data, verdict = self._obey(words, at_ns), "OK"
         except RefusedError as refused:
             data, verdict = str(refused), "RJ"
         numbered = "" if number is None else f" {number:02d}"
-        self._say(f"@{self.config.device:02d} {axis}{numbered} {verdict} {self._status(at_ns)} {data}", at_ns)
+        status = self._iris_status(at_ns) if axis == IRIS_AXIS and self.iris is not None else self._status(at_ns)
+        self._say(f"@{self.config.device:02d} {axis}{numbered} {verdict} {status} {data}", at_ns)
 
     def _say(self, message: str, at_ns: int) -> None:
         if self.config.checksum:
@@ -190,6 +207,37 @@ class ZaberBoard:
             case ["driver", "disable" | "enable" as which]:
                 return self._driver(at_ns, on=which == "enable")
         raise RefusedError("BADCOMMAND")
+
+    # --- axis 2 ----------------------------------------------------------------------------------------------------
+
+    def _obey_iris(self, iris: StepperIris, words: list[str], at_ns: int) -> str:
+        speed_sps = self._setting("maxspeed", {}) / SPEED_UNIT
+        match words:
+            case ["get", "pos"]:
+                return str(round(float(iris.steps_at(at_ns))))
+            case ["get", "limit.max"]:
+                return str(round(iris.steps))
+            case ["get", name]:
+                return self._get(name, at_ns)
+            case ["home"]:
+                self._iris_flags.clear()
+                self._iris_rest_ns = iris.turn(at_ns, 0.0, min(speed_sps, iris.steps / HOMING_S))
+            case ["stop" | "estop"]:
+                iris.halt(at_ns)
+                self._iris_rest_ns = at_ns
+            case ["move", "abs", target, *more] if len(more) <= 2:
+                goal = _number(target)
+                if self._iris_flags or not 0.0 <= goal <= iris.steps:
+                    raise RefusedError("BADDATA")
+                wanted_sps = _number(more[0]) / SPEED_UNIT if more else speed_sps
+                self._iris_rest_ns = iris.turn(at_ns, goal, wanted_sps)
+            case _:
+                raise RefusedError("BADCOMMAND")
+        return "0"
+
+    def _iris_status(self, at_ns: int) -> str:
+        flag = next((flag for flag in SEVERITY if flag in self._iris_flags), "--")
+        return f"{'BUSY' if self._iris_rest_ns > at_ns else 'IDLE'} {flag}"
 
     # --- motion ----------------------------------------------------------------------------------------------------
 
@@ -288,7 +336,7 @@ class ZaberBoard:
             "version": config.version,
             "deviceid": 50_081,
             "device.id": 50_081,
-            "system.axiscount": 1,
+            "system.axiscount": 1 if self.iris is None else 2,
             "system.serial": 12_345,
             "resolution": 64,
             "comm.checksum": int(config.checksum),

@@ -1,0 +1,134 @@
+"""A stepper iris on the second axis of the lens's controller, from the wire to the light."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from elpd_drivers.sim.aperture import StepperIris
+from lens_rigs import Rig, rig
+
+from elpd.calibrate.aperture import measured_on
+from elpd.config import load
+from elpd.errors import ConfigError, LensError
+from elpd.motion.lens_output import aperture_on_lens
+from elpd.rig import build
+
+STEPS, SPEED_SPS = 4800, 12_800.0
+WAY_MS = 1000 * STEPS / SPEED_SPS
+TABLE = {"iris_axis": 2, "iris_open": STEPS, "iris_speed_sps": SPEED_SPS}
+
+
+def with_iris(**more: Any) -> tuple[Rig, StepperIris]:
+    made, iris = rig("zaber"), StepperIris(STEPS, at_steps=STEPS / 2)
+    made.board.add_iris(iris)
+    made.open(**{**TABLE, **more})
+    return made, iris
+
+
+def steps_of(iris: StepperIris, made: Rig) -> float:
+    return float(iris.steps_at(made.clock.now_ns()))
+
+
+def test_closing_for_the_first_time_homes_it_and_opening_takes_its_time() -> None:
+    made, iris = with_iris()
+    aperture = aperture_on_lens({"output": "iris", "opening_ms": 600}, made.lens)
+    with pytest.raises(LensError, match="close it first"):
+        aperture.open()
+    aperture.close()
+    made.live(600)
+    assert steps_of(iris, made) == 0.0
+    stamp = aperture.open()
+    made.live(WAY_MS / 2)
+    assert steps_of(iris, made) == pytest.approx(STEPS / 2, rel=0.02)
+    made.live(WAY_MS)
+    assert steps_of(iris, made) == STEPS
+    assert stamp.begun_ns < iris.began_ns < stamp.begun_ns + 1e6 * WAY_MS / 10
+    assert made.rotor == pytest.approx(3200.0), "the lens stays"
+    aperture.close()
+    made.live(2 * WAY_MS)
+    assert steps_of(iris, made) == 0.0
+
+
+def test_the_lens_moves_and_is_watched_while_it_turns() -> None:
+    made, iris = with_iris()
+    made.lens.set_output("iris", on=False)
+    made.lens.move_to(4800, 6000.0)
+    made.live(600)
+    assert made.rotor == pytest.approx(4800.0)
+    assert steps_of(iris, made) == 0.0
+    estimate = made.lens.position_at(made.clock.now_ns())
+    assert estimate.steps == pytest.approx(4800, abs=0.5)
+
+
+def test_a_refused_turn_is_a_fault() -> None:
+    made, _ = with_iris()
+    made.lens.set_output("iris", on=False)
+    made.live(600)
+    made.board._iris_flags.add("WR")  # it lost its place: a brown-out of its driver
+    made.lens.set_output("iris", on=True)
+    with pytest.raises(LensError, match="BADDATA"):
+        made.live(50)
+
+
+def test_a_fault_of_its_axis_is_named() -> None:
+    made, _ = with_iris()
+    made.lens.set_output("iris", on=False)
+    made.live(600)
+    made.board._iris_flags.add("FM")
+    made.lens.set_output("iris", on=True)
+    with pytest.raises(LensError, match="iris's axis stopped itself: motor or driver too hot"):
+        made.live(50)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"iris_axis": 0}, "need lens.iris_axis"),
+        ({"iris_axis": 1}, "the lens's own axis"),
+        ({"iris_open": 0}, "both 0 steps"),
+        ({"iris_speed_sps": 0.0}, r"iris_speed_sps is 0; give steps/s"),
+        ({"iris_open": 9000}, "axis 2 of the device goes from 0 to 4800"),
+        ({"iris_speed_sps": 1e6}, "at the most"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused(table: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        with_iris(**table)
+
+
+def test_a_device_with_one_axis_says_so() -> None:
+    with pytest.raises(LensError, match="BADAXIS"):
+        rig("zaber").open(**TABLE)
+
+
+def test_what_it_passes_grows_from_dead_band_to_dead_band() -> None:
+    iris = StepperIris(100)
+    iris.turn(0, 100, 100.0)
+    light = iris.transmittance_at(np.array([0, 40_000_000, 500_000_000, 960_000_000, 10**9], np.int64))
+    assert light.tolist() == pytest.approx([0.0, 0.0, 0.25, 1.0, 1.0], abs=1e-6)
+    assert iris.began_ns == pytest.approx(50_000_000)
+    iris.halt(500_000_000)
+    assert float(iris.steps_at(10**9)) == pytest.approx(50.0)
+    with pytest.raises(ConfigError, match="more than 0"):
+        StepperIris(0)
+
+
+def test_the_simulated_rig_has_one_on_its_board() -> None:
+    small = ["sim.width=32", "sim.height=32", "state.profiles=false", "sim.iris_steps=4800"]
+    parts = build(load(overrides=[*small, "sim.board=zaber"]))
+    assert parts.aperture is not None
+    assert parts.aperture.opening_ms == pytest.approx(520.0)
+    assert parts.aperture.close().command == "iris off"
+    with pytest.raises(ConfigError, match="board 'tic' has no second axis"):
+        build(load(overrides=small))
+
+
+def test_a_profile_belongs_to_the_speed_that_it_was_measured_at() -> None:
+    table = ["rig=hardware", "camera.driver=file", "lens.driver=zaber", "aperture.driver=lens-output"]
+    slow, fast = (
+        measured_on(load(overrides=[*table, "lens.iris_axis=2", f"lens.iris_speed_sps={speed}"]))
+        for speed in (100, 200)
+    )
+    assert "lens.iris_speed_sps" in str(slow.difference(fast))
