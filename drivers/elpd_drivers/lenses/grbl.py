@@ -14,6 +14,7 @@ in the position, until the lens is homed. Steps count from the lower end of GRBL
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -324,6 +325,7 @@ class GrblLens:
         sigma_ns = round(self._settings.latency_sigma_us * NS_PER_US)
         quantum = 0.001 * steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
+        # its reports have three decimals: what they round off is the same in all that are made at one place
         timing = Timing(
             reply_ns,
             sigma_ns,
@@ -333,7 +335,7 @@ class GrblLens:
             ramp_steps=RAMP_STEPS,
             pace_sigma=PACE_SIGMA,
         )
-        return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=0.3)
+        return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=math.hypot(0.3, quantum / 12**0.5))
 
     def _wait(self, deadline: HostNs, why: str) -> None:
         now = self._clock.now_ns()
