@@ -14,7 +14,6 @@ in the position, until the lens is homed. Steps count from the lower end of GRBL
 
 from __future__ import annotations
 
-import math
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 0.010
 RAMP_STEPS = 1.5
-"""How far its ramps, and where a stop comes to rest, stray from the model's segments."""
+"""How far its ramps stray from the model's segments."""
 
 PACE_SIGMA = 1e-3 / 3**0.5
 """Pulses are made by a timer of 8 to 16 kHz whose period is rounded to a cycle of 16 MHz: one in a thousand."""
@@ -300,7 +299,7 @@ class GrblLens:
                 sigma_ms, braking_sps2 = measured.onset_sigma_ms, measured.deceleration_sps2 or braking_sps2
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
-                braking = Motion(braking_sps2, segment_s=SEGMENT_S, rounding_steps=RAMP_STEPS)
+                braking = Motion(braking_sps2, segment_s=SEGMENT_S)
                 motor.command(braking, onset_ns, sigma_ms * NS_PER_MS, grace_ms=60)
         self._talk.stopping = True
 
@@ -325,7 +324,6 @@ class GrblLens:
         sigma_ns = round(self._settings.latency_sigma_us * NS_PER_US)
         quantum = 0.001 * steps_per_mm
         reply_ns = round(self._settings.latency_us * NS_PER_US)
-        # its reports have three decimals: what they round off is the same in all that are made at one place
         timing = Timing(
             reply_ns,
             sigma_ns,
@@ -335,7 +333,7 @@ class GrblLens:
             ramp_steps=RAMP_STEPS,
             pace_sigma=PACE_SIGMA,
         )
-        return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=math.hypot(0.3, quantum / 12**0.5))
+        return Motor(timing, slack_steps=32.0, grace_ms=100.0, floor_steps=0.3)
 
     def _wait(self, deadline: HostNs, why: str) -> None:
         now = self._clock.now_ns()
