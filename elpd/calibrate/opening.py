@@ -56,6 +56,9 @@ LEAST_KNOTS = 4
 MOST_NOISE = 0.1
 """Of the burst's peak: with more than that before it, it is not seen to begin."""
 
+LAST_PART = 10
+"""A tenth of the record, at its end, shows what comes once everything is open."""
+
 LEAST = 1e-6
 LAG_DOUBT = 0.25
 """Relative error of a lag's correction: a photoreceptor is of first order only in the first place."""
@@ -215,7 +218,7 @@ def _find_times(t_us: NDArray[np.float64], begin_us: int, end_us: int, pixels: i
             f"ON events come from the interval's very beginning ({begin_us} us): it must hold some darkness before the "
             "opening; begin earlier"
         )
-    clear = total - total[start - 1] - noise * np.arange(1 - start, counts.size - start + 1)
+    clear = total - total[start - 1] - _noise_in_light(counts, noise) * np.arange(1 - start, counts.size - start + 1)
     clear = np.maximum.accumulate(np.maximum(clear, 0.0))
     ends = edges[1:]
     final = float(np.interp(SETTLED * clear[-1], clear, ends))
@@ -230,6 +233,16 @@ def _find_times(t_us: NDArray[np.float64], begin_us: int, end_us: int, pixels: i
         )
     nearly = float(np.interp(NEARLY_SETTLED * clear[-1], clear, ends))
     return _Times(float(edges[start]), knots, 0.5 * (final - nearly))
+
+
+def _noise_in_light(counts: NDArray[np.float64], noise: float) -> float:
+    """Return the events per bin that come behind the open aperture, *noise* being those in the dark.
+
+    Pixels in the light leak and fire by themselves. After a slow opening they do so for as long as it took, and would
+    pass for its end. A record that ends while the aperture opens tells nothing of that.
+    """
+    after = float(counts[-max(1, counts.size // LAST_PART) :].mean())
+    return noise if after > MOST_NOISE * counts.max() else max(noise, after)
 
 
 @dataclass(frozen=True, slots=True)

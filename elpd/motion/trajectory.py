@@ -273,9 +273,11 @@ class Trajectory:
         present = self._epochs[index]
         if when <= present.start_ns or present.number == 0:
             return False
+        superseded_ns = when
         for epoch in reversed(self._epochs[: index + 1]):
-            if epoch.start_ns < when - HELD_UP_NS and epoch is not present:
+            if superseded_ns < when - HELD_UP_NS:
                 break
+            superseded_ns = epoch.start_ns
             velocity = _velocity_where(epoch, report.steps, when + HELD_UP_NS)
             if velocity is not None:
                 anchor = (report.steps, velocity if report.moving else 0.0)

@@ -101,3 +101,12 @@ def test_a_count_that_jumps_back_is_a_fault_where_nothing_can_have_held_it_up(ba
     assert not any(motor.believes(one) for one in jumped[:-1])
     with pytest.raises(Trouble, match="times in a row"):
         motor.believes(jumped[-1])
+
+
+@pytest.mark.parametrize(("late_ms", "believed"), [(60.0, True), (150.0, False)])
+def test_a_stop_that_bites_late_is_the_motion_before_it(late_ms: float, believed: bool) -> None:  # noqa: FBT001
+    model = under_way()
+    model.command(Motion(ACCELERATION_SPS2), 1_000_000_000, 1_000_000)
+    begun_ms = 10.0 + SPEED_SPS / ACCELERATION_SPS2 * 500.0
+    here = SPEED_SPS * (1000.2 + late_ms - begun_ms) / 1e3
+    assert model.resume(report(here, 1000.0 + late_ms)) is believed

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 0.010
 RAMP_STEPS = 1.5
-"""How far its ramps, and where a stop comes to rest, stray from the model's segments."""
+"""How far its ramps stray from the model's segments."""
 
 PACE_SIGMA = 1e-3 / 3**0.5
 """Pulses are made by a timer of 8 to 16 kHz whose period is rounded to a cycle of 16 MHz: one in a thousand."""
@@ -299,7 +299,7 @@ class GrblLens:
                 sigma_ms, braking_sps2 = measured.onset_sigma_ms, measured.deceleration_sps2 or braking_sps2
             ending = motor.planned_rest_ns
             if ending is None or ending > onset_ns:
-                braking = Motion(braking_sps2, segment_s=SEGMENT_S, rounding_steps=RAMP_STEPS)
+                braking = Motion(braking_sps2, segment_s=SEGMENT_S)
                 motor.command(braking, onset_ns, sigma_ms * NS_PER_MS, grace_ms=60)
         self._talk.stopping = True
 
