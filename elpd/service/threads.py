@@ -128,6 +128,7 @@ class Supervisor:
         self._engine = engine
         self._notifier = notifier
         self._overload = Overload(waited_s)
+        self._overload.look(engine.heartbeats.now_s())  # the first look may itself come late
         self._told = ""
         self._slow_looks_ago = FORGOTTEN_AFTER_LOOKS
 

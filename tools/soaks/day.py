@@ -298,6 +298,8 @@ class Day:
         self.ledger.counts["answers"] += 1
         if answer.error is not None:
             self.ledger.counts[f"error {answer.error.kind}"] += 1
+            if answer.error.kind == "InternalError":  # a defect, whatever befell it
+                print(f"{self.elapsed_s:.0f} s  {method}: {answer.error.message}", file=sys.stderr, flush=True)
 
     def _hear(self, event: Any) -> None:
         if event.event == "state" and event.state == "FOCUSING":
