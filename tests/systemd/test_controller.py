@@ -249,7 +249,10 @@ def test_out_of_memory_in_mid_move_is_a_clean_restart(controller: Controller) ->
     begun = len(controller.journal("ELPD_EVENT=rig open"))
     asked = controller.moving()
     with controller.machine.starved("elpd.service") as killed:
+        hungry = [controller.client("runs", limit=20) for _ in range(8)]  # connections and answers need new pages
         controller.machine.until(killed, "the kernel's out-of-memory killer")
+    for client in hungry:
+        client.communicate(timeout=120)
     controller.machine.until(lambda: len(controller.journal("ELPD_EVENT=rig open")) > begun, "the controller's return")
     asked.communicate(timeout=120)
     assert any("at rest" in line["MESSAGE"] for line in controller.journal("_TRANSPORT=stdout"))
