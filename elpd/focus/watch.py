@@ -136,7 +136,7 @@ class Watch:
         """What the sensor says at rest."""
         self.rate = RateWatch()
         """Whether the read-out is full."""
-        self.shedding = Shedding(roi, geometry)
+        self.shedding = Shedding(roi)
         """What of a sweep is not looked at when there is too much of it."""
         self._lamp: Lamplight | None = None
         self._windows: ElpWindows | None = None
