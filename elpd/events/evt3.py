@@ -73,6 +73,14 @@ class Evt3Decoder(WordDecoder):
 
 
 @kernel()
+def forget_other(state: NDArray[np.int64]) -> None:
+    """Let continuations from here on belong to nothing."""
+    state[OTHERS_SUBTYPE] = NO_SUBTYPE
+    state[CONTINUED_SEEN] = 0
+    state[CONTINUED_VALUE] = 0
+
+
+@kernel()
 def take_rare_word(word: Integer, t: Integer, state: NDArray[np.int64], triggers: NDArray[np.int64]) -> None:
     """Account for a word that is neither time, address nor vector. *triggers* is (n, 3): t, id, rising."""
     kind = word >> 12
@@ -97,10 +105,10 @@ def take_rare_word(word: Integer, t: Integer, state: NDArray[np.int64], triggers
             count = state[CONTINUED_VALUE] | (content & 0xF) << 24
             state[RATE_BEFORE if subtype == COUNT_BEFORE_CONTROLLER else RATE_AFTER] += count
             state[RATE_COUNTS] += 1
-            state[OTHERS_SUBTYPE] = NO_SUBTYPE
+            forget_other(state)
         else:
             state[STRAY_CONTINUED] += 1
-            state[OTHERS_SUBTYPE] = NO_SUBTYPE
+            forget_other(state)
     elif kind == 0xA:
         hold_trigger(t, content >> 8, content & 1, state, triggers)
     elif word == 0x9999:
@@ -132,7 +140,7 @@ def take_rare_words(
             count = (first & 0xFFF) | (second & 0xFFF) << 12 | (third & 0xF) << 24
             state[RATE_BEFORE if content == COUNT_BEFORE_CONTROLLER else RATE_AFTER] += count
             state[RATE_COUNTS] += 1
-            state[OTHERS_SUBTYPE] = NO_SUBTYPE
+            forget_other(state)
             return end + np.uint64(3)
     take_rare_word(word, t, state, triggers)
     return end

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.events.evt3 import forget_other
 from elpd.events.jit import kernel
 from elpd.events.lanes import RATE, RATE_KINDS, four_words
-from elpd.events.registers import CONTINUED_SEEN, CONTINUED_VALUE, NO_SUBTYPE, OTHERS_SUBTYPE
+from elpd.events.registers import CONTINUED_SEEN, CONTINUED_VALUE, OTHERS_SUBTYPE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,7 +45,7 @@ def settle_others(words: NDArray[np.uint16], position: int, settled: Any, lane: 
         if word & 0xFFFD == 0xE014:
             whole, _ = is_whole(words, position + settled)
             if whole:
-                state[OTHERS_SUBTYPE] = NO_SUBTYPE
+                forget_other(state)
         elif word >> 12 == 0xE:
             begin_other(word, state)
         settled += 1
@@ -58,7 +59,7 @@ def settle_last(
     if last_other >= settled:
         begin_other(words[position + last_other], state)
     if last_count >= settled and last_count > last_other:
-        state[OTHERS_SUBTYPE] = NO_SUBTYPE
+        forget_other(state)
 
 
 @kernel()

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.events.stream import PacketDecoder
+from elpd.events.counting import EventCounter
 from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from elpd.records import CameraPacket, Geometry, Roi
+    from elpd.records import CameraPacket, Roi
 
 MOST_WAITING_US = 10_000
 """At 4 mm/s the lens goes 40 um in this time, as far as a sweep goes past focus before it is certain of it."""
@@ -45,7 +45,7 @@ class Shedding:
 
     Parameters
     ----------
-    roi, geometry
+    roi
         Events inside *roi* are counted as lost.
 
     Attributes
@@ -54,9 +54,8 @@ class Shedding:
         How much of the time so far was not looked at.
     """
 
-    def __init__(self, roi: Roi, geometry: Geometry) -> None:
-        self._roi = roi
-        self._decoder = PacketDecoder(geometry)
+    def __init__(self, roi: Roi) -> None:
+        self._counter = EventCounter(roi)
         self._slices: deque[tuple[int, int]] = deque(maxlen=SLICES)
         self._until_us: int | None = None
         self._behind = self._gap = False
@@ -83,7 +82,7 @@ class Shedding:
             packet,
             data=_only_time(packet.data, packet.encoding),
             gap_before=True,
-            lost_events=packet.lost_events + self._count(packet),
+            lost_events=packet.lost_events + self._counter.count(packet),
         )
 
     def within(self, begin_us: int, end_us: int) -> int:
@@ -97,13 +96,6 @@ class Shedding:
         if self._behind:  # down to half: few long gaps are easier to judge around than many short ones
             return waiting > 0.5
         return waiting > DESPAIR or (waiting > 1.0 and not shrinks)
-
-    def _count(self, packet: CameraPacket) -> int:
-        events = self._decoder.feed(replace(packet, gap_before=True))
-        roi = self._roi
-        inside = (events.x >= roi.x) & (events.x < roi.x + roi.width)
-        inside &= (events.y >= roi.y) & (events.y < roi.y + roi.height)
-        return int(np.count_nonzero(inside))
 
 
 def _only_time(words: NDArray[Any], encoding: Encoding) -> NDArray[Any]:

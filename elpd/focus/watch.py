@@ -86,7 +86,7 @@ class Watch:
             sensor=sensor,
             picture=picture,
         )
-        self.shedding = Shedding(roi, geometry)
+        self.shedding = Shedding(roi)
         """What of a sweep is not looked at when there is too much of it."""
         self._course: Course | None = None
         self._after: Aftermath | None = None

@@ -52,7 +52,7 @@ def test_windows_of_what_was_heard_are_what_they_would_have_been(encoding: Encod
     member = np.zeros((48, 64), bool)
     member[12:36, 16:48] = True
     whole, shed = (ElpWindows(weights, member, window_us=SLICE_US, origin_us=0) for _ in range(2))
-    shedding = Shedding(ROI, GEOMETRY)
+    shedding = Shedding(ROI)
     taken = [shedding.take(packet) for packet in packets]
     expected = [row for packet in packets for row in whole.feed(packet).tolist()]
     got = [row for packet in taken for row in shed.feed(packet).tolist()]
@@ -72,7 +72,7 @@ def test_windows_of_what_was_heard_are_what_they_would_have_been(encoding: Encod
 
 
 def test_without_a_promise_packets_are_counted() -> None:
-    shedding = Shedding(ROI, GEOMETRY)
+    shedding = Shedding(ROI)
     assert losses(shedding, [*[MOST_PACKETS + 1] * PATIENCE]) == [0] * PATIENCE
     backlogs = (MOST_PACKETS + 1, MOST_PACKETS // 2 + 1, MOST_PACKETS // 2, MOST_PACKETS)
     assert losses(shedding, backlogs) == [1, 1, 0, 0]
@@ -80,7 +80,7 @@ def test_without_a_promise_packets_are_counted() -> None:
 
 
 def test_a_backlog_that_is_made_up_for_costs_nothing() -> None:
-    shedding = Shedding(ROI, GEOMETRY)
+    shedding = Shedding(ROI)
     assert losses(shedding, range(9 * MOST_PACKETS, 0, -1)) == [0] * 9 * MOST_PACKETS
 
 
