@@ -154,6 +154,48 @@ def test_a_cancel_before_the_jog_is_planned_does_nothing(made: Rig) -> None:
     assert made.moving, "the race that real firmware has"
 
 
+def cancelled_in_its_last_moment(when_ms: float) -> str:
+    made = rig("grbl", real_time_us=(3000, 3000))
+    say(made, b"$J=G91X0.1F240\n", when_ms)
+    say(made, b"\x85", 100)
+    assert made.board.stepper.state == "Idle"
+    stuck = say(made, b"$J=G91X0.1F240\n", 100)
+    freed = say(made, b"~", 100)
+    return stuck + "/" + freed
+
+
+def test_a_cancel_in_a_jogs_last_moment_holds_the_board_until_a_resume() -> None:
+    answers = [cancelled_in_its_last_moment(when_ms) for when_ms in np.arange(5.0, 90.0, 1.0)]
+    assert set(answers) == {"ok\r\n/", "/ok\r\n"}
+    assert 1 <= answers.count("/ok\r\n") <= 4
+
+
+@pytest.mark.parametrize("offset", range(20))
+def test_our_driver_frees_a_board_that_a_late_stop_holds(offset: int) -> None:
+    made = open_rig("grbl", real_time_us=(3000, 3000))
+    made.lens.move_to(Steps(3520), 12_800.0)
+    made.live(30.0 + 2 * offset)
+    made.lens.stop(StopMode.RAMPED)
+    made.live(300)
+    made.lens.move_to(Steps(3000), 12_800.0)
+    made.live(300)
+    assert made.rotor == pytest.approx(3000, abs=1)
+    assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(3000, abs=2)
+
+
+def test_a_board_that_another_session_left_in_a_hold_is_reset_by_the_next() -> None:
+    made = rig("grbl", real_time_us=(3000, 3000))
+    stuck = next(ms for ms in np.arange(5.0, 90.0, 1.0) if cancelled_in_its_last_moment(ms) == "/ok\r\n")
+    say(made, b"$J=G91X0.1F240\n", stuck)
+    say(made, b"\x85", 100)
+    before = made.rotor
+    made.port.write(b"$J=G91X0.5F240\n")
+    made.open()
+    made.live(300)
+    assert made.rotor == before, "what the other session still wanted is not done"
+    assert LensFlag.POSITION_UNCERTAIN in made.reports[-1].flags
+
+
 def test_cancel_and_a_new_jog_in_one_write_reverse(made: Rig) -> None:
     say(made, b"$J=G91X1F240\n", 60)
     printed = say(made, b"\x85$J=G91X-1F240\n", 120)

@@ -100,7 +100,7 @@ class _Handshake:
             self._line.send(CANCEL if now < due else RESET)
             self._clock.sleep_until(after_ms(now, 100))
             status = self._status()
-        version = self._ask("$I", "[")
+        version = self._version()
         dialect = dialect_of(version)
         if dialect is None:
             raise LensError(
@@ -117,6 +117,19 @@ class _Handshake:
             homed = self._status(FULL_STATUS).homed
         home = dialect.home_line(board.get(22, 0.0))
         return BoardFacts(limits, board[100], board[130], idle, homed, self._restarted, dialect, home)
+
+    def _version(self) -> list[str]:
+        """Ask for the version; a board that tells its state but takes no line is in a hold, which a reset ends.
+
+        A resume would end it too, and begin whatever motion another session has left in the board.
+        """
+        try:
+            return self._ask("$I", "[")
+        except LensError:
+            self._line.send(RESET)
+            self._restarted = True
+            self._status()
+            return self._ask("$I", "[")
 
     def _tool(self) -> int | None:
         """Return the number of the tool that the board thinks it holds."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-STATUS, CANCEL, RESET = b"?", b"\x85", b"\x18"
+STATUS, CANCEL, RESUME, RESET = b"?", b"\x85", b"~", b"\x18"
 FULL_STATUS = b"\x87"
 """Asks for a report with every field that there is; grblHAL knows it, GRBL takes it as a letter."""
 

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING
 
 from elpd.records import LensFlag, LensReport
 from elpd.units import NS_PER_US, HostNs, after_ms
-from elpd_drivers.lenses.grbl_lines import ALARM_WORDS, CANCEL, ERROR_WORDS, RESET, STATUS, Status, parse_status
+from elpd_drivers.lenses.grbl_lines import (
+    ALARM_WORDS,
+    CANCEL,
+    ERROR_WORDS,
+    RESET,
+    RESUME,
+    STATUS,
+    Status,
+    parse_status,
+)
 from elpd_drivers.lenses.line import Trouble
 from elpd_drivers.lenses.lines import LineReader
 
@@ -177,6 +186,9 @@ class GrblTalk:
         planned = motor.planned_rest_ns
         if not report.moving and not self.unacknowledged and (planned is None or report.earliest_ns > planned):
             motor.at_rest()
+            if self.stopping:
+                # a cancel that came in the jog's last moment holds nothing, for ever: no line is taken any more
+                self._line.send(RESUME)
             self.stopping = False
         elif motor.overdue(report):
             if motor.stops_ignored > STOPS_TRIED:

@@ -112,7 +112,7 @@ class GrblBoard:
         self._busy_ns = begin_ns
         self._real_time: deque[tuple[int, int]] = deque()
         self.stepper = GrblStepper(lens, self.settings, self._firmware.prepared, self._alarm, self._homing_over)
-        self._silent = False
+        self._silent = self._suspended = False
         self._alarmed: int | None = None
         self.outputs: dict[str, bool] = {}
         """The outputs that were switched, by name: for tests."""
@@ -190,7 +190,7 @@ class GrblBoard:
         """Say whether the main loop is elsewhere: homing, suspended by a hold or cancel, or dead after an alarm."""
         stepper = self.stepper
         cancelling = stepper.motion is not None and stepper.motion.holding
-        return self._silent or stepper.held or cancelling or stepper.state == "Home"
+        return self._silent or self._suspended or stepper.held or cancelling or stepper.state == "Home"
 
     # --- reading ---------------------------------------------------------------------------------------------------
 
@@ -213,6 +213,8 @@ class GrblBoard:
             return
         if self._silent or any(pending == byte for _, pending in self._real_time):
             return  # a flag that is already up
+        if byte == 0x85 and self.stepper.state != "Jog":
+            return  # the interrupt looks at the state that is
         due = at_ns + self._random.randint(*self.config.real_time_us) * NS_PER_US
         self._real_time.append((max(due, self._real_time[-1][0] if self._real_time else 0), byte))
 
@@ -231,6 +233,10 @@ class GrblBoard:
             elif stepper.state == "Run" and byte != 0x85:
                 stepper.held = True
                 stepper.hold(at_ns)
+            elif stepper.state == "Idle" and byte == 0x85:
+                self._suspended = True  # the jog ended between interrupt and main loop: a hold of nothing
+        elif byte == 0x7E and self._suspended:
+            self._suspended = False
         elif byte == 0x7E and stepper.held and stepper.motion is None:
             stepper.held = False
             stepper.start_block(at_ns)
@@ -375,7 +381,7 @@ class GrblBoard:
         self._partial.clear()
         self._lines.clear()
         self._busy_ns = at_ns
-        self._silent = False
+        self._silent = self._suspended = False
         self._forget_modes()
         if moving or homing:
             self.lens.halt(at_ns)
