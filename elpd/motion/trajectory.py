@@ -419,7 +419,11 @@ class Trajectory:
 
     def _variance(self, epoch: _Epoch, velocity: float, h: Sensitivity) -> float:
         common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
-        return epoch.lessons.variance(h) + common * common + self._model_variance(epoch, velocity)
+        learnt = epoch.lessons.variance(h)
+        if not velocity and epoch.motion.target_steps is None and epoch.number:
+            # stopped on the way, where the count was rounded each time it was told, to the same side at last
+            learnt = max(learnt, self._timing.rest_quantum_steps**2 / 12)
+        return learnt + common * common + self._model_variance(epoch, velocity)
 
     def _model_variance(self, epoch: _Epoch, velocity: float) -> float:
         strays = self._timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0
