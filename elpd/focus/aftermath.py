@@ -196,11 +196,6 @@ class Aftermath:
         self._passes.add(said, course.leg.sign, (course.decided_us - look_back_us, course.decided_us))
         return self._passes.estimate(settings.play)
 
-    @property
-    def both_ways(self) -> bool:
-        """Whether passes in both directions have found focus: a lens that does not move finds none."""
-        return self._passes.both_ways
-
     def take_for_moving(self) -> None:
         """Take the scene for one that moves: what has been said of it as still is forgotten."""
         self._passes.forget()

@@ -169,8 +169,6 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
     expected = watch.after.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
     if score is not None and score >= RETURN_SIGMAS:
         return seen
-    if watch.scene_moves and watch.after.both_ways:  # what the scene's motion sends is no measure of the lens's
-        return seen
     sharpened = watch.after.sharpened_again()
     if sharpened is not None:
         if way_back_um > settings.depth_of_focus_um and sharpened < RETURN_SHARE:

@@ -192,11 +192,6 @@ class Passes:
         """Direction of the sweep; 0 before it is over."""
         return self._said[0][1] if self._said else 0
 
-    @property
-    def both_ways(self) -> bool:
-        """Whether passes in both directions have found focus."""
-        return len({sign for said, sign in self._said if said.witnesses}) > 1
-
     def hold_any(self, times_us: Sequence[int]) -> bool:
         """Say whether any of the times was near focus."""
         return any(begin <= when <= end for begin, end in self._near_us for when in times_us)

@@ -104,7 +104,7 @@ def _sensor(on: MeasuredOn) -> SensorCalibration:
     fields: dict[str, Any] = {
         name: none for name, field in SensorCalibration.model_fields.items() if field.annotation is Quantity
     }
-    fields |= {"lag_us": Quantity.of(70.0, 9.0, "us"), "mismatch": Quantity.of(0.04, 0.001)}
+    fields |= {"lag_us": Quantity.of(70.0, 9.0, "us")}
     return SensorCalibration(
         **SensorCalibration.head(on, WHEN),
         **fields,
@@ -125,7 +125,7 @@ def test_a_cycle_takes_the_profile_of_its_own_camera_only(tmp_path: Path) -> Non
     save(tmp_path, _sensor(MeasuredOn.camera(config, camera)))
     found = sensor_in_use(config, camera)
     assert found is not None
-    assert (found.hot_pixels, found.lag_us, found.lag_sigma_us, found.mismatch) == (((3, 4),), 70.0, 9.0, 0.04)
+    assert (found.hot_pixels, found.lag_us, found.lag_sigma_us) == (((3, 4),), 70.0, 9.0)
     assert found.noise_on_hz is None
     other = load_config(None, [f"state.directory={tmp_path}", "sim.seed=1"])
     assert sensor_in_use(other, camera) is None
