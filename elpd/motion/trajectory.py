@@ -261,24 +261,25 @@ class Trajectory:
         half = min(MARK_NS, self._timing.reply_ns)
         self.observe(LensReport(steps, HostNs(when_ns - half), HostNs(when_ns + half), None, LensFlag.MOVING))
 
-    def resume(self, report: LensReport) -> bool:
+    def resume(self, report: LensReport, written_ns: int = 0) -> bool:
         """Let the motion under way go on from where *report* has it, if it is only early or late on its way.
 
-        That is a motor that is where the model had it up to ``HELD_UP_NS`` ago, or will have it so soon, under this
-        command or, for a stop that bit late, one before. Anything else is not believed: returns False, and nothing has
-        changed.
+        That is a motor that is where the model had it up to ``HELD_UP_NS`` (and the *written_ns* that the host took to
+        write its command) ago, or will have it ``HELD_UP_NS`` from now, under this command or, for a stop that bit
+        late, one before. Anything else is not believed: returns False, and nothing has changed.
         """
         when, _ = self._sampled(report)
+        held_up_ns = HELD_UP_NS + written_ns
         index = self._index(when)
         present = self._epochs[index]
         if when <= present.start_ns or present.number == 0:
             return False
         superseded_ns = when
         for epoch in reversed(self._epochs[: index + 1]):
-            if superseded_ns < when - HELD_UP_NS:
+            if superseded_ns < when - held_up_ns:
                 break
             superseded_ns = epoch.start_ns
-            velocity = _velocity_where(epoch, report.steps, when + HELD_UP_NS)
+            velocity = _velocity_where(epoch, report.steps, when + HELD_UP_NS, HELD_UP_NS + held_up_ns)
             if velocity is not None:
                 anchor = (report.steps, velocity if report.moving else 0.0)
                 self._epochs.insert(index + 1, _Epoch(when, when, present.motion, 0.0, present.number, anchor))
@@ -438,11 +439,11 @@ class Trajectory:
             del self._epochs[0]
 
 
-def _velocity_where(epoch: _Epoch, steps: float, until_ns: int) -> float | None:
-    """Return the velocity at which *epoch* passed *steps* a while before *until_ns*; None: it did not."""
+def _velocity_where(epoch: _Epoch, steps: float, until_ns: int, while_ns: int) -> float | None:
+    """Return the velocity at which *epoch* passed *steps* in the *while_ns* before *until_ns*; None: it did not."""
     when = until_ns
     after, velocity = state_at(epoch.path, when)
-    while when > max(epoch.start_ns, until_ns - 2 * HELD_UP_NS):
+    while when > max(epoch.start_ns, until_ns - while_ns):
         when -= _LOOK_STEP_NS
         before, velocity = state_at(epoch.path, max(when, epoch.start_ns))
         if min(before, after) <= steps <= max(before, after):

@@ -249,7 +249,8 @@ def ask_events(
     slownesses = _slownesses(start, at_peak, slowness, worth, events.margin)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
     smooth = (SMOOTH_PAIRS if worth is None else SMOOTH_IN_FOCUS) * flank_width(begin, peak)
-    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth)
+    focused = worth is not None
+    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth, focused=focused)
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
     if planes:
         depths = tuple(plane.at for plane in planes)
@@ -280,6 +281,7 @@ def ask_events(
     ]
     image = average_focus(candidates) if candidates else None
     energy, turning = _who_turns(at_peak, bend, weight)
+    turning = turning if focused else energy
     lags, expected = late.candidates, late.typical
     if energy.any():
         typical = [_typical(slow, turning, energy) for slow in slownesses]
@@ -291,7 +293,7 @@ def ask_events(
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
-    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=worth is not None)
+    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=focused)
 
 
 def _who_turns(
@@ -459,13 +461,17 @@ def _pair_mode(
     unmeasured_lag: float,
     calibrated: LagPrior | None,
     smooth: float,
+    *,
+    focused: bool,
 ) -> tuple[Mode | None, _Lateness]:
     """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     past = end - peak
-    # Only dark sides of edges: in log intensity they turn sharply, in focus, where bright sides turn far and wide, and
-    # what a lens does to one side of focus and not to the other shows most.
-    believed = (pairs.on > 0) & (curvature > 0.0) & (pairs.after >= peak - 0.5 * past)
+    # Only dark sides of edges, where slowness is known: in log intensity they turn sharply, in focus, where bright
+    # sides turn far and wide, and what a lens does to one side of focus and not to the other shows most. Elsewhere the
+    # line wants both, which differ more in brightness.
+    sided = (pairs.on > 0) & (curvature > 0.0) if focused else (2.0 * pairs.on - 1.0) * curvature > 0.0
+    believed = sided & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
     weights = (np.abs(curvature) / gap)[believed]
     middle = pairs.middle[believed]

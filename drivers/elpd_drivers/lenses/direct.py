@@ -272,6 +272,7 @@ class DirectLens:
         """Write the stop bytes now, from any thread; the books are kept afterwards."""
         self._motor.stops += 1
         sent = self._line.send(self._controller.stop_bytes[mode])
+        self._motor.written_ns = max(self._motor.written_ns, sent.done_ns - sent.begun_ns)
         effective = sent.off_wire_ns + self._latency.usual_ns
         measured = self._measured.get(mode)
         if measured is not None:
@@ -346,6 +347,7 @@ class DirectLens:
     def _go(self, target: int, speed_sps: float, name: str, stops: int) -> CommandStamp:
         with self._guarded():
             going = self._controller.go(target, speed_sps)
+            self._motor.written_ns = going.done_ns - going.begun_ns
             for off_wire_ns, motion in going.steps:
                 self._obeyed_ns = off_wire_ns + self._latency.usual_ns + 3 * self._latency.sigma_ns
                 self._motor.command(motion, off_wire_ns + self._latency.usual_ns, self._latency.sigma_ns)

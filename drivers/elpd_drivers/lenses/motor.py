@@ -57,6 +57,8 @@ class Motor:
         self.newest_command = 0
         self.stops = 0
         self.stops_ignored = 0
+        self.written_ns = 0
+        """How long the host took to write what is in force: a busy machine may have held it up before it left."""
         self._grace_ns = round(grace_ms * NS_PER_MS)
         self._slack_steps = slack_steps
         self._trajectory = Trajectory(timing, floor_steps=floor_steps)
@@ -167,7 +169,8 @@ class Motor:
                 self._implausible = 0
                 self._trajectory.observe(report)
                 return True
-            if self._implausible + 1 >= CONFIRMATIONS and self._resumed < RESUMES and self._trajectory.resume(report):
+            confirmed = self._implausible + 1 >= CONFIRMATIONS and self._resumed < RESUMES
+            if confirmed and self._trajectory.resume(report, self.written_ns):
                 self._implausible, self._resumed = 0, self._resumed + 1
                 self._expect_rest(report.latest_ns, 0.0, None)
                 return True
