@@ -126,7 +126,6 @@ def test_a_cycle_takes_the_profile_of_its_own_camera_only(tmp_path: Path) -> Non
     found = sensor_in_use(config, camera)
     assert found is not None
     assert (found.hot_pixels, found.lag_us, found.lag_sigma_us) == (((3, 4),), 70.0, 9.0)
-    assert found.noise_on_hz is None
     other = load_config(None, [f"state.directory={tmp_path}", "sim.seed=1"])
     assert sensor_in_use(other, camera) is None
     unwanted = load_config(None, [f"state.directory={tmp_path}", "state.profiles=false"])
