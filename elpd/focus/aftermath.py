@@ -207,10 +207,6 @@ class Aftermath:
 
     # --- a further pass ---
 
-    def follow(self, packet: CameraPacket) -> None:
-        """Let a packet's events go on building the image, while the lens goes to where the pass begins."""
-        self._hearing.follow(packet)
-
     def catch_up(self) -> None:
         """Let the events of the way back that nobody has listened to yet go on building the image."""
         for packet in self._unheard:

@@ -244,9 +244,13 @@ def ask_events(
     groups = by_pixel(events)
     before, at_peak, after = rebuilt(events, groups, np.array([begin, peak, end]))
     bend = at_peak - 0.5 * (before + after)
-    worth = _worth(start, at_peak, events.margin)
+    soft = None if start is None else cv2.GaussianBlur(start, (0, 0), 1.0)
+    worth = None if soft is None else worth_of_an_event(soft, at_peak, events.margin)
     worths = WORTHS if worth is None else tuple(one / worth for one in NEAR_WORTHS)
-    slownesses = _slownesses(start, at_peak, slowness, worth, events.margin)
+    if soft is not None and worth is not None:
+        slownesses = [(1.0 + DARK) / (in_focus(soft, at_peak, worth, events.margin) + DARK)]
+    else:
+        slownesses = _slownesses(start, at_peak, slowness)
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
     smooth = (SMOOTH_PAIRS if worth is None else SMOOTH_IN_FOCUS) * flank_width(begin, peak)
     focused = worth is not None
@@ -330,32 +334,20 @@ def _by_brightness(
     return weight, (1.0 + dark) / (np.maximum(brightness, 0.0).astype(np.float64) + dark)
 
 
-def _worth(start: NDArray[np.float32] | None, level: NDArray[np.float32], margin: int) -> float | None:
-    """Return what an event is worth in log intensity, where *level* is what *start* changed by to focus."""
-    return None if start is None else worth_of_an_event(cv2.GaussianBlur(start, (0, 0), 1.0), level, margin)
-
-
 def _slownesses(
-    start: NDArray[np.float32] | None,
-    level: NDArray[np.float32],
-    slowness: NDArray[np.float64],
-    worth: float | None,
-    margin: int,
+    start: NDArray[np.float32] | None, level: NDArray[np.float32], slowness: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Return candidates of how slow each pixel is: as in the picture in focus, where the *worth* of an event is known.
+    """Return candidates of how slow each pixel is, where it is not known what an event is worth in log intensity.
 
-    A pixel is as slow as the light that it has when it turns, and the start picture was blurred. Where the worth is not
-    known, several are tried, and the picture as it was.
+    A pixel is as slow as the light that it has when it turns, and the start picture was blurred. So several worths are
+    tried, and the picture as it was.
     """
     if start is None:
         return [slowness]
-    if worth is not None:
-        seen = in_focus(cv2.GaussianBlur(start, (0, 0), 1.0), level, worth, margin)
-        return [(1.0 + DARK) / (seen + DARK)]
     found = [slowness]
-    for one in WORTHS:
-        bright = np.maximum(start.astype(np.float64), 0.0) + DARK
-        lit = bright * np.exp(np.clip(level.astype(np.float64) / one, -5.0, 5.0))
+    bright = np.maximum(start.astype(np.float64), 0.0) + DARK
+    for worth in WORTHS:
+        lit = bright * np.exp(np.clip(level.astype(np.float64) / worth, -5.0, 5.0))
         found.append((1.0 + DARK) / np.clip(lit, DARK, 1.0 + DARK))
     return found
 
