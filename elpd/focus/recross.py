@@ -1,10 +1,13 @@
-"""More passes over focus, there and back, where the scene moves and one is not to be believed.
+"""More passes over focus, there and back, where one is not to be believed: the scene moves, or the light is dim.
 
 Whatever answers late (photoreceptors, pixels that hold back less than a threshold, motion that dithers them) is late by
 as much on the way back as on the way there, at the same speed: the mean of the two knows focus, and what is left is the
 play between motor and carriage and what the motion did by chance. The chance is another one in each pass, so passes are
 made until the answer is good enough or there have been enough of them. They are as fast as the sweep, because a scene
 strays with time: a slow pass sees more of its motion.
+
+In a still scene it is dim light that asks for another pass. Photoreceptors are late there by more than an answer may be
+off, and what one pass tells of that hangs on which pixels are how dark. One way back does, at the sweep's speed.
 """
 
 from __future__ import annotations
@@ -31,24 +34,34 @@ MOST_DOUBT_DOF = 1.0
 MOST_ROUNDS = 3
 """Rounds, there and back, at the most: six passes halve the error of one and a half, and take a quarter of a second."""
 
+SIGMAS = 3.0
+"""So many standard errors may a lag lie from what was taken off for it; a depth of focus has to hold them."""
+
 ROUNDS_LEFT = 2.0
 """How many more rounds there must be time for, so that one is begun: the way to focus takes less than one."""
 
 
 def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
-    """Say whether one pass is not enough: the scene has been seen to move.
+    """Say whether one pass is not enough: the scene has been seen to move, or its photoreceptors are slow.
 
-    In a still scene a doubtful answer may come of several depths as well as of the lag; more passes would only make
-    their mixture look certain, so such an answer is refused as it is. Where motion was suspected at rest, the scene is
-    taken for one that moves after all, and what the first pass said of it as still is forgotten. Where events were
-    lost near focus, or a lamp flickers, other passes would not help.
+    In a still scene a doubtful answer may come of several depths as well; more passes would only make their mixture
+    look certain, so an answer that would be doubtful with its lag known is refused as it is. Where motion was suspected
+    at rest, the scene is taken for one that moves after all, and what the first pass said of it as still is forgotten.
+    Where events were lost near focus, or a lamp flickers, other passes would not help.
     """
     if watch.after.gap_near_crossing or watch.lit:
         return False
     doubtful = first is None or first.sigma_um > judging.limit_um(settings)
     if not watch.scene_moves and doubtful and watch.motion_suspected and not watch.after.depths_um:
         watch.after.take_for_moving()
-    return watch.scene_moves
+    return watch.scene_moves or _is_dim(watch, settings)
+
+
+def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
+    """Say whether the lag alone may put an answer out of focus, and nothing else is in the way of one."""
+    lag_um, but_for_it_um = watch.after.lag_um
+    clear = but_for_it_um <= judging.limit_um(settings) and not watch.after.depths_um
+    return clear and SIGMAS * lag_um > settings.depth_of_focus_um
 
 
 def pass_again(
@@ -68,13 +81,14 @@ def pass_again(
     """
     estimate, most_um = first, judging.limit_um(settings)
     furthest_um = stage.here_um()
-    for _ in range(MOST_ROUNDS):
+    for done in range(MOST_ROUNDS):
         begun_ns = stage.now_ns()
         about_um = watch.after.peak_um if estimate is None else estimate.focus_um
         doubt_um = MOST_DOUBT_DOF * settings.depth_of_focus_um
         if estimate is not None:
             doubt_um = min(doubt_um, estimate.sigma_um)
-        for way in (sign, -sign):
+        # The sweep itself is half of a round, but where motion may have misled it by chance there is another first.
+        for way in (sign, -sign) if done or watch.scene_moves else (-sign,):
             rest_um = _pass(stage, watch, settings, about_um, doubt_um, way)
             furthest_um = sign * max(sign * furthest_um, sign * rest_um)
             estimate = watch.after.estimate()
