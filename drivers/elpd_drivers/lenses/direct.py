@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from elpd.errors import LensError
-from elpd.motion.trajectory import REST, Motion
+from elpd.motion.commanded import REST, Motion
 from elpd.records import CommandStamp, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
 from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target, with_measured_stop

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import structlog
 
 from elpd.errors import ConfigError, LensError
-from elpd.motion.trajectory import Motion, Timing
+from elpd.motion.commanded import Motion
+from elpd.motion.trajectory import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import scf4_wire as wire
