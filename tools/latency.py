@@ -4,7 +4,9 @@ Two tables, each privileged (SCHED_FIFO, memory locked) where this user may, and
 
 *Stops*: from the call of ``lens.stop`` to the return of the write that hands its bytes to the port, a pty with a
 simulated board of another process behind it. While nothing else happens but polling, while a flood of replies waits
-unread in the port, and while another thread of this process computes in Python.
+unread in the port, and while another thread of this process computes in Python, which is scheduled as the daemon's
+other threads are: as ordinary, whatever the one that stops the lens may have. The call comes at any moment of the
+caller's turn with the interpreter.
 
 *Reactions*: another process writes EVT3 words of a real recording, or made ones, into a socket, packet by packet, each
 with the instant of writing. This one waits for it, sums the packet's windows, feeds the detector and writes stop bytes
@@ -62,6 +64,9 @@ WARM_UP = 50
 QUESTIONS = {"tic": b"\xa1\x22\x08", "grbl": b"?", "tmcl": bytes((1, 6, 1, 0, 0, 0, 0, 0, 8)), "zaber": b"/get pos\n"}
 """What makes each board talk, for the flood."""
 FLOOD = 500
+LONGEST_TURN_US = 300.0
+"""How long the caller has computed before it stops the lens, at most: several turns with the interpreter."""
+
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 
 
@@ -135,6 +140,7 @@ def stops(board: str, condition: str, count: int) -> NDArray[np.float64]:
             settings |= {"connect_ms": 20_000.0, "trust_position": True}
         lens = rig.find("elpd.lenses", board)(settings, MonotonicClock(), port)
         spent = np.zeros(count)
+        rng = np.random.default_rng(1)
         try:
             with CONDITIONS[condition]():
                 for turn in range(count):
@@ -145,6 +151,7 @@ def stops(board: str, condition: str, count: int) -> NDArray[np.float64]:
                     else:
                         lens.poll()
                         time.sleep(0.001)
+                    compute_for(rng.uniform(0.0, LONGEST_TURN_US))
                     begun = time.monotonic_ns()
                     lens.stop(StopMode.RAMPED)
                     spent[turn] = (port.written_ns - begun) / 1e3
@@ -172,6 +179,7 @@ def busy_thread() -> Iterator[None]:
     ended = threading.Event()
 
     def compute() -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         while not ended.is_set():
             sum(range(1000))
 
@@ -182,6 +190,13 @@ def busy_thread() -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def compute_for(us: float) -> None:
+    """Keep the interpreter busy."""
+    end_ns = time.monotonic_ns() + us * 1e3
+    while time.monotonic_ns() < end_ns:
+        pass
 
 
 CONDITIONS: dict[str, Callable[[], Any]] = {
