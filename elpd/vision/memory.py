@@ -39,9 +39,6 @@ MIN_EVENTS = 1_000
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
-MAINS_HZ = 250.0
-"""Lamps on mains flicker at 100 or 120 Hz; faster lines may be the grid of the time stamps themselves."""
-
 FIRST_CAPACITY = 1 << 17
 
 LEAST_ORDER = 0.75
@@ -141,6 +138,12 @@ class EventMemory:
         _, x, y, on = self._columns
         stamp_events(x[part], y[part], on[part], POINT, levels)
         return BuiltImage(levels, self._forgotten + self._count)
+
+    def sharpest(self) -> NDArray[np.float32]:
+        """Return the image at the peak of the curve, (height, width) in thresholds."""
+        until = int(np.searchsorted(self._t_us, self.track.times_us[self.track.peak], side="left"))
+        nothing = BuiltImage(np.zeros(self._shape, np.float32), 0)
+        return self._upon(nothing if self._start is None else self._start, until)
 
     def change(self) -> NDArray[np.float32]:
         """Return what the events of this memory alone have built, those after the last ``advance`` too."""
@@ -271,7 +274,7 @@ class EventMemory:
         position = sign * ruler.at(self._t_us[part] + round(deaf_us))
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
-        base = None if self._start is None else self._start.levels
+        base = None if self._start is None else self._upon(self._start, begin)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base)
         if begin > 0 or self._forgotten:
             start = None
@@ -289,6 +292,13 @@ class EventMemory:
             hurried=hurried,
         )
 
+    def _upon(self, start: BuiltImage, count: int) -> NDArray[np.float32]:
+        """Return what the first *count* events have made of the image at the start."""
+        levels = start.levels.copy()
+        _, x, y, on = (column[:count] for column in self._columns)
+        stamp_events(x, y, on, POINT, levels)
+        return levels
+
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
         if picture is None:
@@ -304,8 +314,7 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        lamp = self.flicker()
-        if lamp is not None and lamp.frequency_hz < MAINS_HZ:
+        if self.flicker() is not None:
             # What makes pairs of bright pixels differ from those of dark ones is the lamp then, not the lag.
             brightness = start = None
         said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
