@@ -116,7 +116,7 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
         return None
     independent = max(1.0, (highest - lowest) * span_s)
     finer = STEPS_PER_RESOLUTION * bins
-    frequencies = np.fft.rfftfreq(finer, 1e-6 * bin_us)
+    frequencies = np.fft.rfftfreq(finer, 1e-6 * bin_us).astype(np.float64)
     within = (frequencies >= lowest) & (frequencies <= highest)
     frequencies, amplitude = frequencies[within], np.abs(np.fft.rfft(taper * swing, finer)[within])
     variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
