@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.records import Geometry, Roi
-from elpd.vision.bearing import Bearing
+from elpd.vision.bearing import Gauge
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.memory import EventMemory
 
@@ -39,8 +39,8 @@ def main() -> None:
         memory.add(t_us, x, y, on)
         memory.advance(EVENTS, 0.0)
         per_tick = spent_us(lambda m=memory: m.advance(EVENTS, 1.0))  # type: ignore[misc]
-        image = memory.image
-        look = spent_us(lambda i=image: Bearing(ROI_MARGIN_PX, pictured=True).look(i))  # type: ignore[misc]
+        gauge, image = Gauge(ROI_MARGIN_PX), memory.image
+        look = spent_us(lambda g=gauge, i=image: g.look(i, 0))  # type: ignore[misc]
         print(f"{side:>8d}x{side:<3d}{1000 * per_event:>14.1f}{per_tick:>13.0f}{look:>24.0f}")
 
 

@@ -154,16 +154,21 @@ class Aftermath:
     def sharpened_again(self) -> float | None:
         """Return how much sharper the image became on the way back, as a share of what it had lost since its peak.
 
-        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once,
-        with the lens at rest.
+        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once
+        after each way, with the lens at rest.
         """
         track = self._hearing.memory.track
         if not self.scene_moves or self._hearing.lamp is not None or not track.drop > 0.0:
             return None
         lost, far = track.drop, track.values[-1]
-        self.catch_up()
-        self._hearing.memory.advance(self._hearing.last_us, track.positions[-1])
+        self.look()
         return (track.values[-1] - far) / lost
+
+    def look(self) -> None:
+        """Measure how sharp the image is that all events have built."""
+        self.catch_up()
+        memory = self._hearing.memory
+        memory.advance(self._hearing.last_us, memory.track.positions[-1])
 
     # --- where focus was ---
 
@@ -197,8 +202,8 @@ class Aftermath:
         return self._passes.estimate(settings.play)
 
     def take_for_moving(self) -> None:
-        """Take the scene for one that moves: what has been said of it as still is forgotten."""
-        self._passes.forget()
+        """Take the scene for one that moves: of what has been said of it as still only what holds then is believed."""
+        self._passes.take_for_moving()
 
     @property
     def gap_near_crossing(self) -> bool:
@@ -213,11 +218,13 @@ class Aftermath:
             self._hearing.keep(packet)
         self._unheard = []
 
-    def begin_again(self, sign: int, at_us: SensorUs, from_um: float) -> None:
-        """Begin to pass focus once more, in either direction.
+    def begin_again(self, sign: int, from_um: float) -> None:
+        """Begin to pass focus once more, in either direction, with what has not been heard yet.
 
         The image is gone on with; its sharpness is followed from *from_um* on, where the play has been taken up.
         """
+        self.catch_up()
+        at_us = self._hearing.last_us
         self._hearing.begin_again(at_us)
         leg = replace(self._course.leg, sign=sign, begun_us=at_us, judge_from_um=sign * from_um)
         frames = FrameTrack(self._hearing.roi, follow=self.scene_moves)
@@ -232,6 +239,11 @@ class Aftermath:
             self._course.follow(sample)
         for frame in packet.frames:
             self._course.see(frame, self._locate)
+
+    @property
+    def seen_again(self) -> bool:
+        """Whether the further pass has seen the image become sharp, and duller again."""
+        return self._course.passed
 
     def passed_again(self) -> None:
         """End the further pass: from here on packets are of the way back. ``estimate`` may be asked again."""

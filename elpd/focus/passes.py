@@ -10,6 +10,7 @@ import numpy as np
 
 from elpd.units import SensorUs
 from elpd.vision.crossing import frame_witness, fuse, lamp_witness
+from elpd.vision.drift import find_drift
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
 
@@ -55,6 +56,10 @@ class Testimony:
     """How long pixels are deaf after an event, by its events."""
     scene_moves: bool = False
     """Whether the scene moved while it was passed over."""
+    if_it_moves: tuple[Witness, ...] = ()
+    """What is left of a scene that was taken for still, should it turn out to move."""
+    picture: NDArray[np.float32] | None = None
+    """Such a scene at its sharpest, (height, width) in thresholds: where it lay in this pass."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +99,16 @@ class Pass:
         if said is None:
             return Testimony(tuple(self.ask_frames(locate)), deaf=deaf)
         undated_um = 1e-6 * self.speed_um_s * deaf.sigma_us
+        in_motion = replace(self, scene_moves=True)
+        moved = (*in_motion.ask_frames(locate), *self._in_motion(said, undated_um))
         if self.scene_moves or (not said.depths and said.drift.seen):
-            witnesses = [*self.ask_frames(locate), *self._in_motion(said, undated_um)]
-            return Testimony(tuple(witnesses), (), memory.flicker(), deaf, scene_moves=True)
+            return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True)
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, undated_um)))
             for one in said.witnesses(unexplained, self.width_um)
         ]
         frames = [] if said.depths else self.ask_frames(locate)  # of several planes frames show a mixture
-        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf)
+        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
 
     def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
         """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
@@ -179,12 +185,20 @@ class Passes:
         self._near_us.append(near_us)
         self.depths_um = tuple(sign * at for at in said.depths) or self.depths_um
         self.flicker = said.flicker or self.flicker
-        self.scene_moves |= said.scene_moves
+        if said.scene_moves or self._moved_between():
+            self.take_for_moving()
         self.deaf = self.deaf or said.deaf
 
-    def forget(self) -> None:
-        """Forget what witnesses said of a scene that was taken for still; it moves."""
-        self._said = [(Testimony(), sign) for _, sign in self._said]
+    def _moved_between(self) -> bool:
+        """Say whether the newest pass met the scene elsewhere than an earlier one did."""
+        *earlier, newest = (said.picture for said, _ in self._said)
+        return newest is not None and any(
+            find_drift(np.stack([one, newest])).seen_between for one in earlier if one is not None
+        )
+
+    def take_for_moving(self) -> None:
+        """Believe of what was said of a scene that was taken for still only what holds where it moves."""
+        self._said = [(said if said.scene_moves else Testimony(said.if_it_moves), sign) for said, sign in self._said]
         self.scene_moves = True
 
     @property

@@ -141,6 +141,12 @@ class EventMemory:
         stamp_events(x[part], y[part], on[part], POINT, levels)
         return BuiltImage(levels, self._forgotten + self._count)
 
+    def sharpest(self) -> NDArray[np.float32]:
+        """Return the image at the peak of the curve, (height, width) in thresholds."""
+        until = int(np.searchsorted(self._t_us, self.track.times_us[self.track.peak], side="left"))
+        nothing = BuiltImage(np.zeros(self._shape, np.float32), 0)
+        return self._upon(nothing if self._start is None else self._start, until)
+
     def change(self) -> NDArray[np.float32]:
         """Return what the events of this memory alone have built, those after the last ``advance`` too."""
         levels = self.built().levels
@@ -270,7 +276,7 @@ class EventMemory:
         position = sign * ruler.at(self._t_us[part] + round(deaf_us))
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
-        base = None if self._start is None else self._start.levels
+        base = None if self._start is None else self._upon(self._start, begin)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base)
         if begin > 0 or self._forgotten:
             start = None
@@ -287,6 +293,13 @@ class EventMemory:
             dark,
             hurried=hurried,
         )
+
+    def _upon(self, start: BuiltImage, count: int) -> NDArray[np.float32]:
+        """Return what the first *count* events have made of the image at the start."""
+        levels = start.levels.copy()
+        _, x, y, on = (column[:count] for column in self._columns)
+        stamp_events(x, y, on, POINT, levels)
+        return levels
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
