@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 import pytest
 
-from elpd.focus.heading import Stale
 from elpd.focus import passes as room
+from elpd.focus.heading import Stale
 from elpd.focus.passes import NO_PLAY, Passes
 from elpd.records import Geometry, Roi
 from elpd.vision.crossing import Witness
 from elpd.vision.memory import BuiltImage, EventMemory
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 SIDE = 128
 
 
-def scene(shift_px: int = 0) -> np.ndarray:
+def scene(shift_px: int = 0) -> NDArray[np.float32]:
     grain = np.random.default_rng(4).standard_normal((SIDE, SIDE + 40)).astype(np.float32)
     return np.ascontiguousarray(30.0 * cv2.GaussianBlur(grain, (0, 0), 1.5)[:, 20 + shift_px : 20 + shift_px + SIDE])
 
@@ -64,7 +69,7 @@ def test_the_sharpest_image_is_that_of_the_peak_upon_what_was_there_before() -> 
 def test_what_was_shuffled_before_a_pass_does_not_hide_its_peak(earlier: int) -> None:
     """The image becomes sharp and dull again, upon one to which any number of events had come before."""
     sharp = np.abs(scene())
-    start = BuiltImage(0.3 * scene(), earlier)
+    start = BuiltImage(np.float32(0.3) * scene(), earlier)
     memory = EventMemory(Roi(0, 0, SIDE, SIDE), Geometry(SIDE, SIDE), start=start)
     memory.advance(0, 0.0)
     bright = np.argwhere(sharp > np.percentile(sharp, 60))
@@ -82,7 +87,7 @@ def test_what_was_shuffled_before_a_pass_does_not_hide_its_peak(earlier: int) ->
 def test_a_picture_is_stale_once_the_scene_has_gone_two_pixels_and_not_while_it_only_sharpens() -> None:
     picture = cv2.GaussianBlur(scene(), (0, 0), 5.0)
     follows, stands = Stale(picture), Stale(picture)
-    for k in range(0, 40):
+    for k in range(40):
         sharper = cv2.GaussianBlur(scene(), (0, 0), 5.0 - 0.1 * k)
         stands.tick(sharper - picture, 750 * k)
         moved = cv2.warpAffine(sharper, np.array([[1.0, 0.0, 0.1 * k], [0.0, 1.0, 0.0]]), (SIDE, SIDE))
