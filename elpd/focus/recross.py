@@ -46,7 +46,7 @@ LOOKS_FOR_MOTION = 1
 """Rounds that are spent on seeing whether a scene moves that was taken for still: hands tremble at 5 Hz and faster, and
 two passes and a round last long enough for one to be seen on its way."""
 
-LAG_SIGMAS = 3.0
+SIGMAS = 3.0
 """So many standard errors may a lag lie from what was taken off for it; a depth of focus has to hold them."""
 
 ROUNDS_LEFT = 2.0
@@ -54,7 +54,7 @@ ROUNDS_LEFT = 2.0
 
 
 def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
-    """Say whether one pass is not enough: the scene moves, the light is dim, or the answer is doubtful.
+    """Say whether one pass is not enough: the scene has been seen to move, the light is dim, or the answer is doubtful.
 
     Where motion was suspected at rest and the answer is doubtful, the scene is taken for one that moves after all.
     Where events were lost near focus, a lamp flickers or several depths were told, other passes would not help.
@@ -68,10 +68,10 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
 
 
 def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
-    """Say whether the lag alone may put a first answer out of focus, and nothing else is in the way of one."""
+    """Say whether the lag alone may put a still scene's answer out of focus, and nothing else is in the way of one."""
     lag_um, but_for_it_um = watch.after.lag_um
     clear = but_for_it_um <= judging.limit_um(settings) and not watch.after.depths_um
-    return clear and LAG_SIGMAS * lag_um > settings.depth_of_focus_um
+    return clear and SIGMAS * lag_um > settings.depth_of_focus_um
 
 
 def pass_again(
@@ -85,9 +85,9 @@ def pass_again(
     """Go over focus again until it is known or there is no more time: back, and then there and back.
 
     Returns what all passes say and the furthest place, um, in the sweep's direction. In a still scene a doubtful answer
-    may come of several depths as well as of the lag; more passes would only make their mixture look certain. So they
-    are believed only if the lag was all that was doubtful, or if one of them has seen the scene move, which a hand that
-    turned round in the first did not show; else the answer is refused as it is.
+    may come of several depths; more passes would only make their mixture look certain. So they are believed only if it
+    is the lag alone that is in doubt, or if one of them has seen the scene move, which a hand that turned round in the
+    first did not show; else the answer is refused as it is.
 
     The way is bounded: a few times the reach, the ramps and the play; its time is the caller's phase ``recross``. The
     lens is left on the side that the sweep came from.
@@ -106,14 +106,11 @@ def pass_again(
             furthest_um = sign * max(sign * furthest_um, sign * stage.here_um())
             estimate = watch.after.estimate()
         took_ns = stage.now_ns() - begun_ns
-        if not watch.scene_moves and not dim:
-            estimate = first
-            if looks == LOOKS_FOR_MOTION:
-                break
-            continue
-        if estimate is not None and estimate.sigma_um <= certain_um:
-            break
-        if stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
+        if watch.scene_moves or dim:
+            enough = estimate is not None and estimate.sigma_um <= certain_um
+        else:
+            estimate, enough = first, looks == LOOKS_FOR_MOTION
+        if enough or stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
             break
     return estimate, furthest_um
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from elpd.records import FocusEstimate
 from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
-from elpd.vision.drift import Drift, find_drift
+from elpd.vision.drift import LOOKS, Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
 from elpd.vision.light import in_focus, worth_of_an_event
@@ -279,7 +279,8 @@ def ask_events(
         found, at_peak, (peak, end, reach), slownesses, unmeasured_lag, calibrated, smooth, focused=focused
     )
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
-    if planes:
+    # Edges that move make clusters of pairs too.
+    if planes and not find_drift(rebuilt(events, groups, np.linspace(begin, end, LOOKS))).seen:
         depths = tuple(plane.at for plane in planes)
         width = flank_width(begin, peak)
         return EventWitnesses(None, planes[0], late.typical, 0.0, depths, width, pairs_lag=late.typical.at)
@@ -300,12 +301,15 @@ def ask_events(
     first = _image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
     quiet = _curves(images, start, worths, weight, events.margin)
-    bands = [len(BANDS_PX) if still else GHOSTLESS_BANDS, *len(worths) * [len(BANDS_PX)]]
-    curves = quiet if still else loud + quiet
+    # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
+    # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
+    below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
+    bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(worths) * [below]]
+    curves = quiet if still else loud if drift.seen else loud + quiet
     candidates = [
         one
         for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
-        if (one := _image_focus(curve, ticks, peak, count)) is not None
+        if (one := _image_focus(curve, ticks, peak, count)) is not None and (one.as_blur or not drift.seen)
     ]
     image = average_focus(candidates) if candidates else None
     energy, turning = _who_turns(at_peak, bend, weight)
@@ -317,6 +321,10 @@ def ask_events(
         expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
     lag = _as_known(lags) if focused else average_lag(lags, late.weights)
+    if drift.seen:
+        # Edges that move make mirrors wherever they go, those of bright pixels at other times than those of dark ones.
+        lag = expected
+        pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - late.unasked.at)
     if image is not None:
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
@@ -491,6 +499,8 @@ class _Lateness:
     weights: NDArray[np.float64]
     typical: Lag
     """What it makes of the pixels that turned, on the average."""
+    unasked: Lag
+    """The same if no pair had been asked."""
 
 
 def _pair_mode(
@@ -522,7 +532,7 @@ def _pair_mode(
     mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
     if mode is None:
         unknown = [_lag_of(None, unmeasured_lag / float(one.times.mean()), calibrated) for one in slownesses]
-        return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
+        return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0], unknown[0])
     x, y = pairs.x[believed], pairs.y[believed]
     turns = Turns(middle, gap, weights, blocks_of(x, y, level.shape), mode.at, PAIRS_KERNEL * past, reach, smooth)
     slow = [one.at(y, x) for one in slownesses]
@@ -546,7 +556,9 @@ def _pair_mode(
     fit = weights_of_lines(lines)
     lags = [Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)]
     lag = _as_known(lags) if focused else average_lag(lags, fit)
-    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit, lag)
+    nothing = _lag_of(None, unmeasured_lag / usual[0], calibrated)
+    unasked = Lag(usual[0] * nothing.at, usual[0] * nothing.sigma)
+    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit, lag, unasked)
 
 
 def _as_known(lags: list[Lag]) -> Lag:

@@ -115,9 +115,10 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
     if lowest >= highest:
         return None
     independent = max(1.0, (highest - lowest) * span_s)
-    frequencies = np.linspace(lowest, highest, int(STEPS_PER_RESOLUTION * independent) + 2)
-    turns = np.exp(-2j * np.pi * 1e-6 * bin_us * np.outer(frequencies, np.arange(bins)))
-    amplitude = np.abs(turns @ (taper * swing))
+    finer = STEPS_PER_RESOLUTION * bins
+    frequencies = np.fft.rfftfreq(finer, 1e-6 * bin_us).astype(np.float64)
+    within = (frequencies >= lowest) & (frequencies <= highest)
+    frequencies, amplitude = frequencies[within], np.abs(np.fft.rfft(taper * swing, finer)[within])
     variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
     power = amplitude**2 / max(variance, 1e-12)
     power /= max(1.0, float(np.median(power)) / np.log(2.0))
