@@ -154,6 +154,8 @@ class Witness:
     shared: float = 0.0
     held: float = 0.0
     play: float = 0.0
+    freed: float = 0.0
+    """How much lag was taken off ``at``."""
 
     @property
     def total_sigma(self) -> float:
@@ -165,7 +167,13 @@ class Witness:
 
         What was late lies to the other side there, and the carriage is behind the motor by the *play*.
         """
-        return replace(self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma)
+        return replace(
+            self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma, freed=-self.freed
+        )
+
+    def with_lag(self, freed: float, shared: float) -> Witness:
+        """Return the same as if another lag had been taken off, which is known to *shared*."""
+        return replace(self, at=self.at + self.freed - freed, freed=freed, shared=shared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +196,8 @@ class EventWitnesses:
     """How far the scene went across the sensor meanwhile."""
     expected_lag: Lag = field(default_factory=Lag)
     """What the image would have been freed of if no pair had been asked."""
+    pairs_lag: float = 0.0
+    """What the pairs were freed of: they need not be of the pixels that the image shows."""
     in_focus: bool = False
     """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
@@ -211,10 +221,12 @@ class EventWitnesses:
             departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
             dull = (1.0 + HELD_BACK * self.held_back) * width
             sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray * dull))
-            found.append(Witness("vertex", self.image.at, sigma, shared, SYSTEMATIC_IMAGE * dull))
+            held = SYSTEMATIC_IMAGE * dull
+            found.append(Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at))
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
             systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
-            found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
+            sigma = float(np.hypot(self.pairs.sigma, systematic))
+            found.append(Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag))
         return found
 
 
@@ -270,7 +282,8 @@ def ask_events(
     # Edges that move make clusters of pairs too.
     if planes and not find_drift(rebuilt(events, groups, np.linspace(begin, end, LOOKS))).seen:
         depths = tuple(plane.at for plane in planes)
-        return EventWitnesses(None, planes[0], late.typical, 0.0, depths, flank_width(begin, peak))
+        width = flank_width(begin, peak)
+        return EventWitnesses(None, planes[0], late.typical, 0.0, depths, width, pairs_lag=late.typical.at)
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
         rows = busiest_rows(events, SAMPLE_PX)
         events, weight = rows_of(events, rows), weight[rows]
@@ -316,7 +329,16 @@ def ask_events(
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
-    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=focused)
+    return EventWitnesses(
+        image,
+        pairs,
+        lag,
+        held_back,
+        drift=drift,
+        expected_lag=expected,
+        in_focus=focused,
+        pairs_lag=late.typical.at,
+    )
 
 
 def _who_turns(

@@ -44,8 +44,8 @@ MAX_EVENTS = 1 << 23
 FIRST_CAPACITY = 1 << 17
 
 LEAST_ORDER = 0.75
-"""Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
-motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
+"""Energy that the image has won over that of the same number of random events. Still scenes have 1 to 30 and the
+paper's violent motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
 
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
@@ -237,12 +237,20 @@ class EventMemory:
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
 
     def _shows_a_picture(self) -> bool:
-        """Whether the image is sharper, at its peak, than as many events at random would have made it."""
+        """Whether the image has become sharper, up to its peak, than as many events at random would have made it.
+
+        Counted from the curve's lowest point on: what earlier passes and motion have shuffled before stays in the image
+        on both sides of the peak.
+        """
         track = self.track
+        energies = np.exp(track.values[: track.peak + 1])
+        lowest = int(np.argmin(energies))
+        begin, end = (int(np.searchsorted(self._t_us, track.times_us[k], side="left")) for k in (lowest, track.peak))
+        begin = 0 if lowest == 0 else begin
         height, width = self._shape
-        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
-        at_random = band_gain(BANDS_PX[0]) * until / (height * width)
-        return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
+        at_random = band_gain(BANDS_PX[0]) * (end - begin) / (height * width)
+        gained = float(energies[-1]) - (0.0 if self._start is None and lowest == 0 else float(energies[lowest]))
+        return gained > LEAST_ORDER * at_random
 
     def ask(
         self,

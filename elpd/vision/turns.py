@@ -242,8 +242,8 @@ def _step(
     normal = design.T @ weighted
     # A regressor that is nothing, or the same as another, gets nothing.
     normal += 1e-9 * np.trace(normal) * np.eye(normal.shape[0]) + 1e-300 * np.eye(normal.shape[0])
-    at = np.linalg.solve(normal, weighted.T @ values)
-    return at, kept, values - design @ at
+    solved = np.asarray(np.linalg.solve(normal, weighted.T @ values), dtype=np.float64)
+    return solved, kept, values - design @ solved
 
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
