@@ -321,10 +321,11 @@ def ask_events(
         expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
     lag = _as_known(lags) if focused else average_lag(lags, late.weights)
+    pairs_lag = late.typical
     if drift.seen:
         # Edges that move make mirrors wherever they go, those of bright pixels at other times than those of dark ones.
-        lag = expected
-        pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - late.unasked.at)
+        lag, pairs_lag = expected, late.unasked
+        pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - pairs_lag.at)
     if image is not None:
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
@@ -337,7 +338,7 @@ def ask_events(
         drift=drift,
         expected_lag=expected,
         in_focus=focused,
-        pairs_lag=late.typical.at,
+        pairs_lag=pairs_lag.at,
     )
 
 
