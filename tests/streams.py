@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from elpd.events.simd import available
 from elpd.events.stream import EventStream, open_recording
 
-needs_lanes = pytest.mark.skipif(not available(), reason="this processor has no AVX-512")
+needs_lanes = pytest.mark.skipif(not available(), reason="this processor has neither AVX-512 nor AVX2")
 sizes = st.integers(1, 70)
 seeds = st.integers(0, 2**32 - 1)
 cuts = st.lists(st.integers(0, 300), max_size=6)

@@ -30,7 +30,7 @@ from benchmarks.calibration import calibrations
 from benchmarks.cases import cases_of
 from benchmarks.executors import EXECUTORS
 from benchmarks.folder import claim
-from benchmarks.goals import tell, verdicts
+from benchmarks.goals import verdicts
 from benchmarks.live import read_live
 from benchmarks.methods import all_methods
 from benchmarks.recorded import recorded_cases
@@ -38,6 +38,7 @@ from benchmarks.report import write_report
 from benchmarks.runner import Task, Work, finished, run_all, wanted_pairs
 from benchmarks.scoring import scores
 from benchmarks.sets import FRAME_PERIODS_US, SETS
+from benchmarks.verdict import tell
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

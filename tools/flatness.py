@@ -51,8 +51,8 @@ def main() -> int:
             decoder.feed(piece)
             first.add_packet(packet)
             meters[1].feed(packet)
-            for row in meters[0].feed(packet):
-                detector.feed(ElpSample(*row.item()))
+            for row in meters[0].feed(packet).tolist():
+                detector.feed(ElpSample(*row))
                 windows += 1
         if (turn + 1) * LINES // rounds > turn * LINES // rounds:
             most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

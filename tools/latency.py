@@ -4,7 +4,9 @@ Two tables, each privileged (SCHED_FIFO, memory locked) where this user may, and
 
 *Stops*: from the call of ``lens.stop`` to the return of the write that hands its bytes to the port, a pty with a
 simulated board of another process behind it. While nothing else happens but polling, while a flood of replies waits
-unread in the port, and while another thread of this process computes in Python.
+unread in the port, and while another thread of this process computes in Python, which is scheduled as the daemon's
+other threads are: as ordinary, whatever the one that stops the lens may have. The call comes at any moment of the
+caller's turn with the interpreter.
 
 *Reactions*: another process writes EVT3 words of a real recording, or made ones, into a socket, packet by packet, each
 with the instant of writing. This one waits for it, sums the packet's windows, feeds the detector and writes stop bytes
@@ -36,11 +38,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from elpd_drivers.lenses.serial_port import SerialPort
+from speed import stream
 
 from elpd import rig
 from elpd.config import load
 from elpd.events.evt3_encode import Evt3Encoder
-from elpd.events.stream import open_recording
 from elpd.records import CameraPacket, ElpSample, Encoding, Geometry, StopMode
 from elpd.timebase import MonotonicClock
 from elpd.units import HostNs
@@ -56,9 +58,15 @@ PRIORITY = 70
 SWITCH_S = 5e-5
 WINDOW_US = 1000
 SENSOR = Geometry(1280, 720)
+RANDOM_EVENTS = 1_000_000
+WARM_UP = 50
+"""Packets that are not counted."""
 QUESTIONS = {"tic": b"\xa1\x22\x08", "grbl": b"?", "tmcl": bytes((1, 6, 1, 0, 0, 0, 0, 0, 8)), "zaber": b"/get pos\n"}
 """What makes each board talk, for the flood."""
 FLOOD = 500
+LONGEST_TURN_US = 300.0
+"""How long the caller has computed before it stops the lens, at most: several turns with the interpreter."""
+
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 
 
@@ -73,7 +81,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
     sys.setswitchinterval(SWITCH_S)
-    words = _words(arguments.file, arguments.words)
+    sensor, words = stream_words(arguments.file, arguments.words * (arguments.packets + WARM_UP))
     answer: dict[str, Any] = {
         "board": arguments.board,
         "words_per_packet": arguments.words,
@@ -91,7 +99,7 @@ def main() -> int:
             for condition in CONDITIONS:
                 spent = stops(arguments.board, condition, arguments.stops)
                 answer["stops"].append({**common, "condition": condition, **_summary("call_to_written", spent)})
-            sent, own = reactions(words, arguments.words, arguments.packets)
+            sent, own = reactions(sensor, words, arguments.words, arguments.packets)
             figures = {**_summary("sent", sent), **_summary("own", own), **_summary("machine_gap", floor)}
             answer["reactions"].append({**common, **figures})
     print(json.dumps(answer) if arguments.json else _table(answer))
@@ -132,6 +140,7 @@ def stops(board: str, condition: str, count: int) -> NDArray[np.float64]:
             settings |= {"connect_ms": 20_000.0, "trust_position": True}
         lens = rig.find("elpd.lenses", board)(settings, MonotonicClock(), port)
         spent = np.zeros(count)
+        rng = np.random.default_rng(1)
         try:
             with CONDITIONS[condition]():
                 for turn in range(count):
@@ -142,6 +151,7 @@ def stops(board: str, condition: str, count: int) -> NDArray[np.float64]:
                     else:
                         lens.poll()
                         time.sleep(0.001)
+                    compute_for(rng.uniform(0.0, LONGEST_TURN_US))
                     begun = time.monotonic_ns()
                     lens.stop(StopMode.RAMPED)
                     spent[turn] = (port.written_ns - begun) / 1e3
@@ -169,6 +179,7 @@ def busy_thread() -> Iterator[None]:
     ended = threading.Event()
 
     def compute() -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         while not ended.is_set():
             sum(range(1000))
 
@@ -181,6 +192,13 @@ def busy_thread() -> Iterator[None]:
         thread.join()
 
 
+def compute_for(us: float) -> None:
+    """Keep the interpreter busy."""
+    end_ns = time.monotonic_ns() + us * 1e3
+    while time.monotonic_ns() < end_ns:
+        pass
+
+
 CONDITIONS: dict[str, Callable[[], Any]] = {
     "reader idle": ExitStack,
     "replies flood in": ExitStack,
@@ -191,9 +209,12 @@ CONDITIONS: dict[str, Callable[[], Any]] = {
 # --- reactions -----------------------------------------------------------------------------------------------------
 
 
-def reactions(words: NDArray[np.uint16], per_packet: int, packets: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def reactions(
+    sensor: Geometry, words: NDArray[np.uint16], per_packet: int, packets: int
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the microseconds from writing, and from waking, to the stop bytes' writing, for each packet."""
-    windows = ElpWindows(np.ones((SENSOR.height, SENSOR.width), np.int16), window_us=WINDOW_US)
+    weights = np.random.default_rng(1).integers(-1020, 1021, (sensor.height, sensor.width))
+    windows = ElpWindows(weights, window_us=WINDOW_US)
     detector = Detector()
     ours, theirs = socket.socketpair()
     master, slave = pty.openpty()
@@ -203,12 +224,12 @@ def reactions(words: NDArray[np.uint16], per_packet: int, packets: int) -> tuple
     buffer = bytearray(8 + 2 * per_packet)
     view = memoryview(buffer)
     sent, own = np.zeros(packets), np.zeros(packets)
-    sender = multiprocessing.get_context("fork").Process(target=send, args=(theirs, words, per_packet, packets + 50))
+    sender = multiprocessing.get_context("fork").Process(target=send, args=(theirs, words, per_packet))
     sender.start()
     waiting = select.poll()
     waiting.register(ours, select.POLLIN)
     try:
-        for turn in range(-50, packets):  # the first fifty warm up
+        for turn in range(-WARM_UP, packets):
             waiting.poll()
             woken = time.monotonic_ns()
             filled = 0
@@ -217,8 +238,8 @@ def reactions(words: NDArray[np.uint16], per_packet: int, packets: int) -> tuple
             stamp = struct.unpack_from("<q", buffer)[0]
             payload = np.frombuffer(buffer, np.uint16, offset=8)
             packet = CameraPacket(encoding=Encoding.EVT3, data=payload, received_ns=HostNs(woken))
-            for row in windows.feed(packet):
-                detector.feed(ElpSample(*row.item()))
+            for row in windows.feed(packet).tolist():
+                detector.feed(ElpSample(*row))
             os.write(slave, stop_bytes)
             done = time.monotonic_ns()
             if turn >= 0:
@@ -235,37 +256,26 @@ def reactions(words: NDArray[np.uint16], per_packet: int, packets: int) -> tuple
     return sent, own
 
 
-def send(socket_end: socket.socket, words: NDArray[np.uint16], per_packet: int, packets: int) -> None:
+def send(socket_end: socket.socket, words: NDArray[np.uint16], per_packet: int) -> None:
     """Write packets, one each half millisecond, each behind the instant of its writing."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    n_pieces = len(words) // per_packet
-    for turn in range(packets):
-        piece = words[(turn % n_pieces) * per_packet :][:per_packet].tobytes()
+    for begin in range(0, len(words), per_packet):
+        piece = words[begin : begin + per_packet].tobytes()
         time.sleep(0.0005)
         socket_end.sendall(struct.pack("<q", time.monotonic_ns()) + piece)
 
 
-def _words(path: Path | None, per_packet: int) -> NDArray[np.uint16]:
-    """Take the beginning of a recording, or make events at random."""
-    wanted = 500 * per_packet
+def stream_words(path: Path | None, n_words: int) -> tuple[Geometry, NDArray[np.uint16]]:
+    """Return so many words of a recording, or of events made at random, whose time goes on: a step back costs more."""
     if path is not None:
-        pieces, have = [], 0
-        reader = open_recording(path)
-        for packet in reader.packets():
-            pieces.append(np.array(packet.data).view(np.uint16))
-            have += len(pieces[-1])
-            if have >= wanted:
-                break
-        reader.close()
-        return np.concatenate(pieces)[:wanted]
+        sensor, words = stream.payload(path)
+        return sensor, stream.tiled(words, sensor, n_words)[:n_words]
     rng = np.random.default_rng(1)
-    count = wanted
-    t = np.sort(rng.integers(0, 200_000, count))
-    x, y = rng.integers(0, SENSOR.width, count), rng.integers(0, SENSOR.height, count)
-    encoder = Evt3Encoder(SENSOR.width)
-    return encoder.encode(t, x.astype(np.uint16), y.astype(np.uint16), rng.integers(0, 2, count).astype(np.uint8))[
-        :wanted
-    ]
+    t = np.sort(rng.integers(0, 200_000, RANDOM_EVENTS))
+    x, y = rng.integers(0, SENSOR.width, RANDOM_EVENTS), rng.integers(0, SENSOR.height, RANDOM_EVENTS)
+    p = rng.integers(0, 2, RANDOM_EVENTS)
+    words = Evt3Encoder(SENSOR.width).encode(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
+    return SENSOR, stream.tiled(words, SENSOR, n_words)[:n_words]
 
 
 # --- the machine ---------------------------------------------------------------------------------------------------

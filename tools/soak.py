@@ -39,7 +39,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     log.configure()
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(50))
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))
     figures = _day(chosen) if chosen.service is None else _hour(chosen)
     if chosen.json:
         print(json.dumps(figures))

@@ -26,6 +26,7 @@ from speed.ours import ours
 from speed.peers import DECODERS, FRAME, LOOP, peers
 
 from elpd.errors import ElpdError
+from elpd.events.simd import instructions
 
 WRONG = ("expelliarmus",)
 
@@ -81,6 +82,7 @@ def measure(path: Path, rounds: int, megabytes: float) -> dict[str, Any]:
     ratios, spreads, reasons = compare(speeds, per_megabyte, absent)
     return {
         "file": path.name,
+        "simd": instructions(),
         "bytes": words.nbytes,
         "events": n_events,
         "rounds": rounds,
@@ -129,7 +131,8 @@ def compare(
 
 def tell(answer: dict[str, Any]) -> None:
     """Print a table."""
-    print(f"{answer['file']}, tiled to {answer['bytes'] / 1e6:.0f} MB, {answer['rounds']} rounds, CPU time")
+    size = f"tiled to {answer['bytes'] / 1e6:.0f} MB"
+    print(f"{answer['file']}, {size}, {answer['rounds']} rounds, CPU time, {answer['simd'] or 'no SIMD'}")
     for row in answer["rows"]:
         if row["mb_s"] is None:
             print(f"{row['name']:<36}  none: {row['reason']}")

@@ -59,6 +59,7 @@ def take_openings(
             stage.listener = keeper.keep
             try:
                 stage.wait_ms(DARK_MS)
+                stage.learn_time()
                 stamp = aperture.open()
                 until = after_ms(stamp.begun_ns, AFTER_FACTOR * aperture.opening_ms + DARK_MS)
                 while stage.now_ns() < until:

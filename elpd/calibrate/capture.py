@@ -227,6 +227,7 @@ class Capture:
         self._stage.wait_ms(SETTLE_MS)
 
     def _now_us(self) -> int:
+        self._stage.learn_time()
         return int(self._stage.sensor_clock.to_sensor(self._stage.now_ns()))
 
     def _path(self, begin_us: int, end_us: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -76,7 +76,7 @@ if available():  # elsewhere it does not compile
 
 
 class Evt3BlockDecoder(WordDecoder):
-    """Decode EVT3 words (uint16), in pieces of any size, to arrays, with AVX-512. See ``WordDecoder``."""
+    """Decode EVT3 words (uint16), in pieces of any size, to arrays, with AVX-512 or AVX2. See ``WordDecoder``."""
 
     def __init__(self, geometry: Geometry) -> None:
         scratch = (np.zeros(LISTS, np.uint32), np.zeros(LEDGER_SIZE, np.int64))

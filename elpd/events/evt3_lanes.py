@@ -50,6 +50,7 @@ from elpd.events.lanes import (
     pack_places,
     pack_run,
     pack_words,
+    pack_words_before,
     spread,
     take_counts,
 )
@@ -214,7 +215,7 @@ def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001
                         triples |= np.uint32(triple_there) << np.uint32(lane)
             # Mostly each ADDR_X has a row of its own, right before it.
             if x & ~(y << np.uint32(1) | row_before) & np.uint32(0xFFFF_FFFF) | vector & taken == 0:
-                pack_words(words, at - 1, np.uint32(x), lists, rows + n_x)
+                pack_words_before(words, at, np.uint32(x), lists, rows + n_x)
             else:
                 row = np.int64(words[position + last_row]) if last_row >= 0 else state[ROW]
                 spread(words, at, np.uint32(y), row, lists, LANE_ROWS + begin)

@@ -1,12 +1,11 @@
 """Thirty-two EVT3 words at a time: what a block of words is made of, and lists of what it says.
 
-A block is 32 words of 16 bits, one AVX-512 register; masks are ``uint32``, bit i for word i of the block. Which word is
-of which kind is worked out from four planes of bits, one for each bit of the kind, because the processor has more room
-for arithmetic on masks than for comparisons of vectors. What a word means depends on words before it (its row, its
-time), and where it is not simply the word before, that is a scan: the index of the nearest word of a kind at or before
-each lane, by five steps of "take the larger of yourself and your neighbour 1, 2, 4, 8, 16 to the left", then one
-permutation that fetches what those words say. Events leave by compression, so that lists stay dense and in stream order
-without a branch.
+A block is 32 words of 16 bits, one register of AVX-512 or two of AVX2; masks are ``uint32``, bit i for word i of the
+block. Which word is of which kind is worked out from four planes of bits, one for each bit of the kind, because the
+processor has more room for arithmetic on masks than for comparisons of vectors. What a word means depends on words
+before it (its row, its time), and where it is not simply the word before, that is a scan: the nearest word of a kind at
+or before each lane, by five steps of "take the later of yourself and your neighbour 1, 2, 4, 8, 16 to the left". Events
+leave by compression, so that lists stay dense and in stream order without a branch.
 
 Lists are of 16 bits; a place in a list counts in those, whatever the array's own numbers are.
 """
@@ -35,12 +34,13 @@ from elpd.events.simd import (
     lanes_left,
     load,
     operation,
-    packed,
     population,
     running,
     splat,
     store,
+    wide,
 )
+from elpd.events.simd_lanes import fetch, moved_up, store_packed
 
 RATE = 0x7000_F000_F000_E014
 RATE_KINDS = 0xF000_F000_F000_FFFD
@@ -116,43 +116,62 @@ def kinds(builder: Builder, words: Value, at: Value, high: Value, low_from: Valu
 def spread(builder: Builder, words: Value, at: Value, mask: Value, before: Value, out: Value, begin: Value) -> None:
     """Write for each lane the content of the nearest word in *mask* at or before it; until the first, *before*."""
     content = builder.and_(load(builder, words, at, WORDS), constant(WORDS, 0x0FFF))
-    zero = constant(WORDS, 0)
-    index = builder.select(builder.bitcast(mask, BITS), iota(WORDS), zero)
-    for shift in (1, 2, 4, 8, 16):
-        order = ir.Constant(ir.VectorType(I32, LANES), [LANES] * shift + list(range(LANES - shift)))
-        moved = builder.shuffle_vector(index, zero, order)
-        index = builder.select(builder.icmp_unsigned(">", moved, index), moved, index)
-    found = call(builder, "llvm.x86.avx512.permvar.hi.512", WORDS, [content, index])
+    said = builder.bitcast(mask, BITS)
+    found = _by_index(builder, content, said) if wide() else _by_content(builder, content, said)
     before_first = builder.and_(builder.not_(mask), builder.sub(mask, I32(1)))
     of_lane = builder.select(builder.bitcast(before_first, BITS), splat(builder, before, WORDS), found)
     store(builder, of_lane, as_words(builder, out), begin)
 
 
+def _by_index(builder: Builder, content: Value, said: Value) -> Value:
+    """Spread which lane says something, then fetch what: where any lane may be fetched at once."""
+    zero = constant(WORDS, 0)
+    index = builder.select(said, iota(WORDS), zero)
+    for shift in (1, 2, 4, 8, 16):
+        moved = moved_up(builder, index, shift, zero)
+        index = builder.select(builder.icmp_unsigned(">", moved, index), moved, index)
+    return call(builder, "llvm.x86.avx512.permvar.hi.512", WORDS, [content, index])
+
+
+def _by_content(builder: Builder, content: Value, said: Value) -> Value:
+    """Spread what is said, marked by the sign bit."""
+    zero = constant(WORDS, 0)
+    content = builder.select(said, builder.or_(content, constant(WORDS, 0x8000)), zero)
+    for shift in (1, 2, 4, 8, 16):
+        moved = moved_up(builder, content, shift, zero)
+        content = builder.select(builder.icmp_signed("<", content, zero), content, moved)
+    return builder.and_(content, constant(WORDS, 0x7FFF))
+
+
 @operation(types.void, [types.uint16], types.int64, types.uint32, _LIST, types.int64)
 def pack_words(builder: Builder, words: Value, at: Value, mask: Value, out: Value, n: Value) -> None:
-    """Write the contents of the words in *mask* densely to *out* from *n* on, where there must be room for 32.
+    """Write the contents of the words in *mask* densely to *out* from *n* on, where there must be room for 32."""
+    content = builder.and_(load(builder, words, at, WORDS), constant(WORDS, 0x0FFF))
+    store_packed(builder, content, mask, as_words(builder, out), n)
 
-    Only words in *mask* are read.
-    """
-    pointer = builder.bitcast(builder.gep(words, [at]), WORDS.as_pointer())
-    arguments = [pointer, I32(2), builder.bitcast(mask, BITS), constant(WORDS, 0)]
-    block = call(builder, "llvm.masked.load.v32i16.p0", WORDS, arguments)
-    content = builder.and_(block, constant(WORDS, 0x0FFF))
-    store(builder, packed(builder, content, mask), as_words(builder, out), n)
+
+@operation(types.void, [types.uint16], types.int64, types.uint32, _LIST, types.int64)
+def pack_words_before(builder: Builder, words: Value, at: Value, mask: Value, out: Value, n: Value) -> None:
+    """Write the contents of the words one before each in *mask* densely to *out* from *n* on; room as above."""
+    first = builder.icmp_signed("==", at, I64(0))
+    before = builder.select(first, at, builder.sub(at, I64(1)))
+    entering = builder.insert_element(constant(WORDS, 0), builder.load(builder.gep(words, [before])), I32(0))
+    block = moved_up(builder, load(builder, words, at, WORDS), 1, entering)
+    store_packed(builder, builder.and_(block, constant(WORDS, 0x0FFF)), mask, as_words(builder, out), n)
 
 
 @operation(types.void, _LIST, types.int64, types.uint32, _LIST, types.int64)
 def pack(builder: Builder, lists: Value, begin: Value, mask: Value, out: Value, n: Value) -> None:
     """Write those of 32 numbers from *begin* on that are in *mask* densely to *out* from *n* on; room as above."""
     lanes = load(builder, as_words(builder, lists), begin, WORDS)
-    store(builder, packed(builder, lanes, mask), as_words(builder, out), n)
+    store_packed(builder, lanes, mask, as_words(builder, out), n)
 
 
 @operation(types.void, types.int64, types.uint32, _LIST, types.int64)
 def pack_places(builder: Builder, at: Value, mask: Value, out: Value, n: Value) -> None:
     """Write ``at + i`` for each bit i of *mask* densely to *out* from *n* on; room as above."""
     places = builder.add(iota(WORDS), splat(builder, at, WORDS))
-    store(builder, packed(builder, places, mask), as_words(builder, out), n)
+    store_packed(builder, places, mask, as_words(builder, out), n)
 
 
 @operation(types.void, types.int64, types.int64, types.uint32, _LIST, types.int64)
@@ -162,7 +181,7 @@ def pack_run(builder: Builder, first: Value, on: Value, mask: Value, out: Value,
     within = builder.icmp_unsigned("<", column, constant(WORDS, 2048))
     column = builder.select(within, column, constant(WORDS, BEYOND))
     column = builder.or_(column, splat(builder, builder.shl(on, I64(11)), WORDS))
-    store(builder, packed(builder, column, mask), as_words(builder, out), n)
+    store_packed(builder, column, mask, as_words(builder, out), n)
 
 
 @operation(types.void, _LIST, types.int64, _LIST, types.int64, types.int64)
@@ -217,12 +236,11 @@ def take_counts(builder: Builder, words: Value, position: Value, lists: Value, b
     sums = [running(builder, LONGS) for _ in range(2)]
     zero = constant(LONGS, 0)
     lists = as_words(builder, lists)
-    from_here = builder.bitcast(builder.gep(words, [position]), ir.IntType(8).as_pointer())
+    from_here = builder.gep(words, [position])
     with cgutils.for_range_slice(builder, I64(0), n, I64(8)) as (done, _):
         place = load(builder, lists, builder.add(begin, done), ir.VectorType(I16, 8))
         there = lanes_left(builder, done, n, some)
-        arguments = [zero, from_here, builder.zext(place, some), there, I32(2)]
-        four = call(builder, "llvm.x86.avx512.mask.gather.dpq.512", LONGS, arguments)
+        four = fetch(builder, from_here, builder.zext(place, some), there, LONGS)
         whole = builder.icmp_unsigned("==", builder.and_(four, constant(LONGS, RATE_KINDS)), constant(LONGS, RATE))
 
         def bits(shift: int, mask: int, four: Value = four) -> Value:
@@ -233,7 +251,7 @@ def take_counts(builder: Builder, words: Value, position: Value, lists: Value, b
         for which, total in zip((builder.not_(is_after), is_after), sums, strict=True):
             add(builder, total, builder.select(builder.and_(whole, which), number, zero))
         rest = builder.and_(there, builder.not_(whole))
-        store(builder, packed(builder, place, rest), lists, builder.add(begin, builder.load(kept)))
+        store_packed(builder, place, rest, lists, builder.add(begin, builder.load(kept)))
         add(builder, kept, population(builder, rest))
     totals = [call(builder, "llvm.vector.reduce.add.v8i64", I64, [builder.load(total)]) for total in sums]
     return [builder.load(kept), *totals]

@@ -11,7 +11,6 @@ from elpd.events.simd import (
     I8,
     I16,
     I64,
-    LONGS,
     Builder,
     UniTuple,
     Value,
@@ -21,13 +20,11 @@ from elpd.events.simd import (
     lanes_left,
     load,
     operation,
-    packed,
-    part,
     population,
     running,
     splat,
-    store,
 )
+from elpd.events.simd_lanes import store_packed
 
 SIXTEEN = ir.VectorType(I16, 16)
 
@@ -70,7 +67,14 @@ def unpack(
     inside_count, no_row_count, no_column_count = (running(builder, I64) for _ in range(3))
     lists = as_words(builder, lists)
     first_column, first_row = (splat(builder, side, HALF) for side in (width, height))
-    since = splat(builder, base, LONGS)
+
+    def since(low: Value) -> Value:
+        longs = ir.VectorType(I64, low.type.count)
+        return builder.add(builder.zext(low, longs), splat(builder, base, longs))
+
+    def narrow(lanes: Value) -> Value:
+        return builder.trunc(lanes, ir.VectorType(I8, lanes.type.count))
+
     with cgutils.for_range_slice(builder, I64(0), n, I64(16)) as (begin, _):
         there = lanes_left(builder, begin, n, HALF)
         x, on = column_and_polarity(builder, load(builder, lists, builder.add(columns, begin), SIXTEEN))
@@ -78,13 +82,11 @@ def unpack(
         in_row = builder.and_(builder.icmp_unsigned("<", y, first_row), there)
         inside = builder.and_(builder.icmp_unsigned("<", x, first_column), in_row)
         at = builder.load(inside_count)
-        low = builder.zext(load(builder, lists, builder.add(lows, begin), SIXTEEN), HALF)
-        low = packed(builder, low, inside)
-        for half in (0, 8):
-            time = builder.zext(part(builder, low, half, 8), LONGS)
-            store(builder, builder.add(time, since), out_t, builder.add(at, I64(half)))
-        for values, out, kind in ((x, out_x, I16), (y, out_y, I16), (builder.zext(on, HALF), out_p, I8)):
-            store(builder, builder.trunc(packed(builder, values, inside), ir.VectorType(kind, 16)), out, at)
+        low = load(builder, lists, builder.add(lows, begin), SIXTEEN)
+        store_packed(builder, low, inside, out_t, at, since)
+        store_packed(builder, builder.trunc(x, SIXTEEN), inside, out_x, at)
+        store_packed(builder, builder.trunc(y, SIXTEEN), inside, out_y, at)
+        store_packed(builder, builder.zext(on, SIXTEEN), inside, out_p, at, narrow)
         add(builder, inside_count, population(builder, inside))
         add(builder, no_row_count, population(builder, builder.and_(builder.not_(in_row), there)))
         add(builder, no_column_count, population(builder, builder.and_(builder.not_(inside), in_row)))

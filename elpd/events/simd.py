@@ -1,8 +1,9 @@
 """Vector operations that numba has no word for, as LLVM intrinsics: how to make them, and their common pieces.
 
-Everything made of this selects instructions of AVX-512 (F, BW, VL, DQ, VBMI2: Intel since 2019, AMD since 2022).
-``available()`` says whether kernels that use it may be *compiled* at all. It asks what numba compiles for, which is
-also what numba keys its cache on: code cached by one processor is not found by another.
+Everything made of this selects instructions of AVX-512 (F, BW, VL, DQ, VBMI2: Intel since 2019, AMD since 2022) where
+there are any, or of AVX2 (Intel since 2013, AMD since 2015). ``available()`` says whether kernels that use it may be
+*compiled* at all, ``wide()`` for which. Both ask what numba compiles for, which is also what numba keys its cache on:
+code cached by one processor is not found by another.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 UniTuple = types.UniTuple  # type: ignore[attr-defined]  # numba ships half of its types
-NEEDED = ("avx512f", "avx512bw", "avx512vl", "avx512dq", "avx512vbmi2")
+AVX512 = frozenset({"+avx512f", "+avx512bw", "+avx512vl", "+avx512dq", "+avx512vbmi2"})
+AVX2 = frozenset({"+avx2", "+popcnt"})
 
 LANES = 32
 I1, I8, I16, I32, I64 = (ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
@@ -32,10 +34,24 @@ Value = Any
 
 
 @cache
-def available() -> bool:
-    """Say whether numba compiles for a processor that has these instructions."""
+def _features() -> frozenset[str]:
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
-    return {f"+{name}" for name in NEEDED} <= set(features.split(","))
+    return frozenset(features.split(","))
+
+
+def instructions() -> str | None:
+    """Return the name of the instructions that numba compiles these operations to; ``None`` if there are none."""
+    return "AVX-512" if wide() else "AVX2" if _features() >= AVX2 else None
+
+
+def available() -> bool:
+    """Say whether numba compiles for a processor that has such instructions, of either kind."""
+    return instructions() is not None
+
+
+def wide() -> bool:
+    """Say whether it has those of AVX-512."""
+    return _features() >= AVX512
 
 
 def operation(result: Any, *parameters: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -120,15 +136,6 @@ def store(builder: Builder, value: Value, data: Value, index: Value) -> None:
     """Store a vector from an element on, aligned to elements."""
     pointer = builder.bitcast(builder.gep(data, [index]), value.type.as_pointer())
     builder.store(value, pointer).align = value.type.element.width // 8
-
-
-def packed(builder: Builder, values: Value, mask: Value) -> Value:
-    """Return the lanes in *mask* (bits, or one number of them) moved together."""
-    vector = values.type
-    if isinstance(mask.type, ir.IntType):
-        mask = builder.bitcast(mask, ir.VectorType(I1, vector.count))
-    name = f"llvm.x86.avx512.mask.compress.v{vector.count}i{vector.element.width}"
-    return call(builder, name, vector, [values, constant(vector, 0), mask])
 
 
 def population(builder: Builder, bits: Value) -> Value:

@@ -49,6 +49,7 @@ def expose(
     if isinstance(camera, Biases):
         camera.apply_biases(BiasSet.EXPOSE)
     stage.wait_ms(DARK_MS)
+    stage.learn_time()
 
     stamp = aperture.open()
     first = FirstEventMap(camera.geometry, begin_us=stage.sensor_clock.to_sensor(stamp.begun_ns))

@@ -169,7 +169,7 @@ class Hearing:
         Under a lamp a window holds what whole periods leave, and that is remembered for the estimate.
         """
         assert self._windows is not None, "begin() comes first"
-        for row in self._windows.feed(packet):
+        for row in self._windows.feed(packet).tolist():
             sample = self._net(self._placed.sample(row))
             self.events += sample.n_on + sample.n_off
             yield sample

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from elpd.records import ElpSample
 from elpd.units import SensorUs
@@ -18,21 +18,13 @@ class Placed:
         self._locate = locate
         self._last = (SensorUs(-1), 0.0)
 
-    def sample(self, row: Any) -> ElpSample:
-        """Return a row of ``ElpWindows`` with its place and travel in um."""
-        begin, end = SensorUs(int(row["begin_us"])), SensorUs(int(row["end_us"]))
+    def sample(self, row: tuple[int, ...]) -> ElpSample:
+        """Return a row of ``ElpWindows``, as Python numbers, with its place and travel in um."""
+        begin_us, end_us, elp, energy, n_on, n_off, n_capped = row
+        begin, end = SensorUs(begin_us), SensorUs(end_us)
         before_us, before_um = self._last
         from_um = before_um if before_us == begin else self._locate(begin)
         to_um = self._locate(end)
         self._last = end, to_um
-        return ElpSample(
-            begin,
-            end,
-            int(row["elp"]),
-            int(row["energy"]),
-            int(row["n_on"]),
-            int(row["n_off"]),
-            int(row["n_capped"]),
-            0.5 * (from_um + to_um),
-            to_um - from_um,
-        )
+        place_um, travel_um = 0.5 * (from_um + to_um), to_um - from_um
+        return ElpSample(begin, end, elp, energy, n_on, n_off, n_capped, place_um, travel_um)

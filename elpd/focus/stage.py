@@ -134,9 +134,11 @@ class Stage:
             self.parts.camera.enable_trigger(on=True)
 
     def _mark(self, edges: tuple[Trigger, ...]) -> None:
-        """Tell the lens at what times it was at places it knows."""
+        """Tell the lens at what times it was at places it knows; before the camera has told its time nobody knows."""
         lens = self.parts.lens
         assert isinstance(lens, TakesMarks), "edges are read for such a lens only"
+        if not self.sensor_clock.known:
+            return
         for edge in edges:
             if edge.id == lens.mark_channel:
                 self.marks = (self.marks or 0) + lens.mark(self.sensor_clock.to_host(edge.t_us))
@@ -210,12 +212,20 @@ class Stage:
             if packet is None:
                 continue
             spoken_us = packet.complete_until_us
-            if spoken_us is None or self.sensor_clock.to_host(spoken_us) >= begun_ns:
+            if self.sensor_clock.known and (spoken_us is None or self.sensor_clock.to_host(spoken_us) >= begun_ns):
                 return
         raise CameraError(
             f"camera: silent for {(self.now_ns() - self.last_packet_ns) / NS_PER_MS:.0f} ms (limit {limit_ms:.0f}); "
             "check its cable and power"
         )
+
+    def learn_time(self) -> None:
+        """Read until the camera has told its time, which ties its stamps to the host's; at once where it has.
+
+        Raises ``CameraError`` if it has not within 200 ms.
+        """
+        if not self.sensor_clock.known:
+            self.hear(SILENCE_MS)
 
     def newest_frame(self, limit_ms: float) -> Frame | None:
         """Wait for a frame that was exposed after now; ``None`` if none came."""

@@ -20,47 +20,18 @@ What it refuses to do: guess before the first report, or beyond its memory. It h
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from elpd.errors import LensError
-from elpd.motion.kinematics import Knot, Piece, approach, in_segments, lay_out, ramp, state_at
-from elpd.motion.lessons import Lessons, Sensitivity
+from elpd.motion.commanded import REST, Motion
+from elpd.motion.epoch import FURTHER_STEPS, Epoch
+from elpd.motion.kinematics import Knot, lay_out, state_at
 from elpd.records import LensFlag, LensReport, PositionEstimate
 from elpd.units import NS_PER_S, HostNs
 
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """What was commanded: a velocity, an absolute target, or a halt (``velocity_sps`` 0, infinite acceleration).
-
-    ``speed_sps`` bounds the way to ``target_steps`` and is unused otherwise. ``segment_s`` is the length of the
-    firmware's constant-speed segments, 0 for none. ``rounding_steps`` is one standard deviation of what the firmware
-    adds by itself (a stop goes on to the next whole step).
-    """
-
-    acceleration_sps2: float
-    velocity_sps: float = 0.0
-    target_steps: float | None = None
-    speed_sps: float = 0.0
-    segment_s: float = 0.0
-    rounding_steps: float = 0.0
-
-    def pieces(self, steps: float, velocity_sps: float) -> tuple[Piece, ...]:
-        """Plan the motion from a state."""
-        if self.target_steps is None:
-            pieces = ramp(velocity_sps, self.velocity_sps, self.acceleration_sps2)
-        else:
-            pieces = approach(steps, velocity_sps, self.target_steps, self.speed_sps, self.acceleration_sps2)
-        return in_segments(pieces, self.segment_s) if self.segment_s else pieces
-
-    def changing_speed(self, velocity_sps: float) -> bool:
-        """Say whether *velocity_sps* is on the way from or to what was commanded."""
-        cruise = abs(self.velocity_sps) if self.target_steps is None else self.speed_sps
-        return velocity_sps != 0.0 and abs(abs(velocity_sps) - cruise) > 1e-6 * max(cruise, 1.0)
-
-
-REST = Motion(acceleration_sps2=math.inf, rounding_steps=0.3)
-"""A halt without a ramp."""
+if TYPE_CHECKING:
+    from elpd.motion.lessons import Sensitivity
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,48 +57,6 @@ class Timing:
     pace_sigma: float = 0.0
 
 
-@dataclass(slots=True)
-class _Epoch:
-    """One command in force: its three layouts, what was learnt about it, and the reports that taught it.
-
-    ``anchor`` is the state that it goes on from where that is not its predecessor's: steps, steps/s. ``nominal_ns``
-    is when the command was expected to take effect and ``start_ns`` the value that the layouts are made around;
-    ``delay`` is counted from there.
-    """
-
-    nominal_ns: int
-    start_ns: int
-    motion: Motion
-    delay_sigma_s: float
-    number: int = 0
-    anchor: tuple[float, float] | None = None
-    marked: bool = False
-    steps: float = 0.0
-    variance: float = 0.0
-    path: list[Knot] = field(default_factory=list)
-    later: list[Knot] = field(default_factory=list)
-    further: list[Knot] = field(default_factory=list)
-    later_s: float = 0.0
-    lessons: Lessons = field(default_factory=Lessons)
-    reports: list[LensReport] = field(default_factory=list)
-
-    def forget_lessons(self, pace_sigma: float) -> None:
-        """Go back to what was supposed before any report."""
-        delay = (self.nominal_ns - self.start_ns) / NS_PER_S
-        self.lessons = Lessons.supposed(self.variance, delay, self.delay_sigma_s, pace_sigma)
-
-    def depends(self, when_ns: int) -> tuple[float, float, Sensitivity]:
-        """Return position, velocity, and how the position depends on what is learnt."""
-        steps, velocity = state_at(self.path, when_ns)
-        h = Sensitivity(
-            (state_at(self.further, when_ns)[0] - steps) / _FURTHER_STEPS,
-            (state_at(self.later, when_ns)[0] - steps) / self.later_s if self.later_s else 0.0,
-            velocity * max(when_ns - self.start_ns, 0) / NS_PER_S,
-        )
-        return steps + self.lessons.shift(h), velocity, h
-
-
-_FURTHER_STEPS = 1.0
 _MAX_REPORTS = 256
 _RELAY_S = 2e-4
 _RELAYS = 4
@@ -135,7 +64,6 @@ MARK_NS = 2_000
 """A mark's edge leaves with the step, and a camera stamps it to the microsecond."""
 _UNLIKELY = 3.0
 """Standard deviations beyond which a report at rest shows that the model's own are too small."""
-_LOOK_STEP_NS = 1_000_000
 HELD_UP_NS = 100_000_000
 """How late or early a motion may be on its way and still be the one commanded.
 
@@ -170,7 +98,7 @@ class Trajectory:
         self._timing = timing
         self._floor_variance = floor_steps * floor_steps
         self._history_ns = round(history_s * NS_PER_S)
-        self._epochs: list[_Epoch] = []
+        self._epochs: list[Epoch] = []
         self._commands = 0
         self.held_ns = 0
         """How long the line is known to keep replies back, after they were sampled as promptly as ever."""
@@ -184,10 +112,10 @@ class Trajectory:
         """Forget everything and begin from *report*: at rest, or at the velocity that it tells."""
         velocity = report.velocity_sps or 0.0
         when, _ = self._sampled(report)
-        epoch = _Epoch(when, when, Motion(math.inf, velocity), 0.0)
+        epoch = Epoch(when, when, Motion(math.inf, velocity), 0.0)
         epoch.steps, epoch.variance = report.steps, self._reading_variance(velocity, 0.0)
         epoch.path = lay_out(when, report.steps, epoch.motion.pieces(report.steps, velocity))
-        epoch.further = lay_out(when, report.steps + _FURTHER_STEPS, epoch.motion.pieces(report.steps, velocity))
+        epoch.further = lay_out(when, report.steps + FURTHER_STEPS, epoch.motion.pieces(report.steps, velocity))
         epoch.forget_lessons(self._timing.pace_sigma)
         self._epochs = [epoch]
 
@@ -202,7 +130,7 @@ class Trajectory:
         while len(self._epochs) > 1 and self._epochs[-1].start_ns >= effective_ns:
             self._epochs.pop()
         start = max(effective_ns, self._epochs[-1].start_ns)
-        self._epochs.append(_Epoch(start, start, motion, sigma_ns / NS_PER_S, self._commands))
+        self._epochs.append(Epoch(start, start, motion, sigma_ns / NS_PER_S, self._commands))
         self._follow(len(self._epochs) - 1)
         self._forget(start - self._history_ns)
         return self._commands
@@ -220,10 +148,11 @@ class Trajectory:
     def expect(self, report: LensReport) -> Surprise:
         """Say how far *report* is from the model, without learning from it. Raises ``LensError`` before ``begin``."""
         when, sigma_s = self._sampled(report)
-        epoch = self._epochs[self._index(when)]
+        index = self._index(when)
+        epoch = self._epochs[index]
         steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
-        variance = self._variance(epoch, velocity, h) + reading
+        variance = self._variance(epoch, velocity, h) + self._early_variance(index, when, velocity) + reading
         return Surprise(report.steps - steps, math.sqrt(variance))
 
     def observe(self, report: LensReport) -> None:
@@ -234,18 +163,18 @@ class Trajectory:
         when, _ = self._sampled(report)
         index = self._index(when)
         epoch = self._epochs[index]
-        if epoch.reports and _says_nothing_new(epoch, report, when):
+        if epoch.hears_nothing_new(report, when):
             return
         if epoch.marked and report.moving and report.latest_ns - report.earliest_ns > 2 * MARK_NS:
             return  # its latency, which all reports share, would outvote the marks
         if not report.moving and self._rests_elsewhere(epoch, report, when):
-            self._epochs.insert(index + 1, _Epoch(when, when, REST, 0.0, epoch.number, (report.steps, 0.0)))
+            self._epochs.insert(index + 1, Epoch(when, when, REST, 0.0, epoch.number, (report.steps, 0.0)))
             self._follow_from(index + 1)
             return
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
-        self._correct(epoch, report)
+        self._correct(index, report)
         if self._relay(index):
             self._follow_from(index)
         elif index + 1 < len(self._epochs):
@@ -279,10 +208,10 @@ class Trajectory:
             if superseded_ns < when - held_up_ns:
                 break
             superseded_ns = epoch.start_ns
-            velocity = _velocity_where(epoch, report.steps, when + HELD_UP_NS, HELD_UP_NS + held_up_ns)
+            velocity = epoch.passed(report.steps, when + HELD_UP_NS, HELD_UP_NS + held_up_ns)
             if velocity is not None:
                 anchor = (report.steps, velocity if report.moving else 0.0)
-                self._epochs.insert(index + 1, _Epoch(when, when, present.motion, 0.0, present.number, anchor))
+                self._epochs.insert(index + 1, Epoch(when, when, present.motion, 0.0, present.number, anchor))
                 self._follow_from(index + 1)
                 return True
         return False
@@ -292,12 +221,13 @@ class Trajectory:
 
         Raises ``LensError`` before the first report and beyond the history.
         """
-        epoch, steps, velocity, h = self._state(when)
-        return PositionEstimate(steps, math.sqrt(self._variance(epoch, velocity, h)))
+        when, index, steps, velocity, h = self._state(when)
+        variance = self._variance(self._epochs[index], velocity, h) + self._early_variance(index, when, velocity)
+        return PositionEstimate(steps, math.sqrt(variance))
 
     def velocity_at(self, when: HostNs) -> float:
         """Return the modelled velocity in steps/s at *when*."""
-        return self._state(when)[2]
+        return self._state(when)[3]
 
     def at_rest_from(self) -> int | None:
         """Return when the motion commanded last ends, in ns, or None if it does not end by itself."""
@@ -308,7 +238,7 @@ class Trajectory:
 
     # --- below: how it is done -----------------------------------------------------------------------------------
 
-    def _rests_elsewhere(self, epoch: _Epoch, report: LensReport, when: int) -> bool:
+    def _rests_elsewhere(self, epoch: Epoch, report: LensReport, when: int) -> bool:
         """Say whether a motor at rest, by itself and by the model, is not where a model too sure of itself has it.
 
         At rest the controller's own count is exact, whatever was supposed of the way there.
@@ -318,7 +248,7 @@ class Trajectory:
         surprise = self.expect(report)
         return abs(surprise.steps) > _UNLIKELY * surprise.sigma_steps
 
-    def _state(self, when: int) -> tuple[_Epoch, float, float, Sensitivity]:
+    def _state(self, when: HostNs) -> tuple[HostNs, int, float, float, Sensitivity]:
         if not self._epochs:
             raise LensError("lens: position asked for before the controller reported any; poll it first")
         oldest = self._epochs[0]
@@ -328,9 +258,9 @@ class Trajectory:
                     f"lens: position asked for {(oldest.start_ns - when) / 1e6:.1f} ms before the oldest that is "
                     f"remembered (history {self._history_ns / NS_PER_S:.0f} s); ask sooner"
                 )
-            when = oldest.start_ns  # the first report found it at rest
-        epoch = self._epochs[self._index(when)]
-        return (epoch, *epoch.depends(when))
+            when = HostNs(oldest.start_ns)  # the first report found it at rest
+        index = self._index(when)
+        return (when, index, *self._epochs[index].depends(when))
 
     def _index(self, when: int) -> int:
         for index in range(len(self._epochs) - 1, 0, -1):
@@ -374,7 +304,7 @@ class Trajectory:
                 self._reading_variance(velocity, self._timing.reply_sigma_ns / NS_PER_S),
             )
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
-        further = steps + _FURTHER_STEPS
+        further = steps + FURTHER_STEPS
         epoch.further = lay_out(start, further, motion.pieces(further, velocity))
         epoch.later_s = min(epoch.delay_sigma_s, _RELAY_S)
         if epoch.later_s:
@@ -384,7 +314,7 @@ class Trajectory:
             epoch.later += lay_out(late, late_steps, motion.pieces(late_steps, late_velocity))
         epoch.forget_lessons(self._timing.pace_sigma)
         for report in epoch.reports:
-            self._correct(epoch, report)
+            self._correct(index, report)
 
     def _relay(self, index: int) -> bool:
         """Move an epoch's start to where its delay says, if that is far; say whether it moved."""
@@ -411,22 +341,38 @@ class Trajectory:
                 self._follow(index - 1)
         return moved
 
-    def _correct(self, epoch: _Epoch, report: LensReport) -> None:
+    def _correct(self, index: int, report: LensReport) -> None:
+        epoch = self._epochs[index]
         when, sigma_s = self._sampled(report)
         steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
-        noise = reading + self._model_variance(epoch, velocity)
+        noise = reading + self._model_variance(epoch, velocity) + self._early_variance(index, when, velocity)
         epoch.lessons.correct(report.steps - steps, h, noise)
 
-    def _variance(self, epoch: _Epoch, velocity: float, h: Sensitivity) -> float:
+    def _variance(self, epoch: Epoch, velocity: float, h: Sensitivity) -> float:
         common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
-        learnt = epoch.lessons.variance(h)
-        if not velocity and epoch.motion.target_steps is None and epoch.number:
-            # stopped on the way, where the count was rounded each time it was told, to the same side at last
-            learnt = max(learnt, self._timing.rest_quantum_steps**2 / 12)
+        learnt = max(epoch.lessons.variance(h), self._rounding_variance(epoch, velocity))
         return learnt + common * common + self._model_variance(epoch, velocity)
 
-    def _model_variance(self, epoch: _Epoch, velocity: float) -> float:
+    def _rounding_variance(self, epoch: Epoch, velocity: float) -> float:
+        """Return what no number of reports averages away of their rounding.
+
+        Asked at regular intervals, a motor at some speeds is told with the same rounding error each time; and one that
+        was stopped on its way, with the last one for ever. Marks are not rounded, and targets are known.
+        """
+        if velocity:
+            return 0.0 if epoch.marked else self._timing.quantum_steps**2 / 12
+        stopped = epoch.motion.target_steps is None and epoch.number
+        return self._timing.rest_quantum_steps**2 / 12 if stopped else 0.0
+
+    def _early_variance(self, index: int, when: int, velocity: float) -> float:
+        """Return what it adds that the command after epoch *index* may have begun before its time."""
+        if index + 1 == len(self._epochs):
+            return 0.0
+        strays = self._epochs[index + 1].strays_if_begun_early(when, velocity)
+        return strays * strays
+
+    def _model_variance(self, epoch: Epoch, velocity: float) -> float:
         strays = self._timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0
         return self._floor_variance + strays * strays
 
@@ -437,24 +383,3 @@ class Trajectory:
     def _forget(self, before: int) -> None:
         while len(self._epochs) > 2 and self._epochs[1].start_ns < before:
             del self._epochs[0]
-
-
-def _velocity_where(epoch: _Epoch, steps: float, until_ns: int, while_ns: int) -> float | None:
-    """Return the velocity at which *epoch* passed *steps* in the *while_ns* before *until_ns*; None: it did not."""
-    when = until_ns
-    after, velocity = state_at(epoch.path, when)
-    while when > max(epoch.start_ns, until_ns - while_ns):
-        when -= _LOOK_STEP_NS
-        before, velocity = state_at(epoch.path, max(when, epoch.start_ns))
-        if min(before, after) <= steps <= max(before, after):
-            return velocity
-        after = before
-    return None
-
-
-def _says_nothing_new(epoch: _Epoch, report: LensReport, when: int) -> bool:
-    """At rest the same rounded number again is the same rounding error again, not more evidence."""
-    last = epoch.reports[-1]
-    vaguer = last.latest_ns - last.earliest_ns > 2 * (report.latest_ns - report.earliest_ns)
-    again = report.steps == last.steps and not report.moving and not last.moving and not vaguer
-    return again and state_at(epoch.path, when)[1] == 0.0

@@ -9,7 +9,7 @@ other, so that the answer is on the tape.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from elpd.ports import (
     Biases,
@@ -30,24 +30,13 @@ from elpd.ports import (
     Temperature,
     TriggerInput,
 )
+from elpd.record.double import Double
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from elpd.record.seams import Channel, RigFacts
     from elpd.records import BiasSet, CommandStamp, LensCapabilities, Roi, StopMode, StopTiming
     from elpd.units import HostNs
-
-
-class Double:
-    """What every double is made of: the constants of its rig, and whom it asks."""
-
-    device: ClassVar[str]
-
-    def __init__(self, facts: RigFacts, channel: Channel) -> None:
-        self._facts = facts
-        self._ask = channel.ask
-        self._ask_array = channel.ask_array
 
 
 class _WithHardwareRoi(Double):

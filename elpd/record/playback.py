@@ -18,7 +18,8 @@ import numpy as np
 from elpd import errors, records
 from elpd.errors import FormatError, ReplayDiverged
 from elpd.record.codec import number, to_json
-from elpd.record.seams import RigFacts, build_doubles
+from elpd.record.double import RigFacts
+from elpd.record.seams import build_doubles
 from elpd.record.tape import ARRAYS_FILE, TAPE_FILE, TAPE_FORMAT, digest
 from elpd.units import HostNs, SensorUs, Steps
 

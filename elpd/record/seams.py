@@ -10,11 +10,11 @@ Properties are read once, when the rig is taped, and are constants from then on,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from elpd.ports import Identified, Latency, Outputs, RigParts, TakesMarks
-from elpd.record.abilities import ABILITIES, Double, abilities_of, ability_methods
+from elpd.record.abilities import ABILITIES, abilities_of, ability_methods
+from elpd.record.double import Double, RigFacts
 from elpd.scale import LensScale
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.ports import Aperture, Clock, EventCamera, Lens
+    from elpd.record.double import Channel
     from elpd.records import (
         CameraPacket,
         CommandStamp,
@@ -37,52 +38,23 @@ if TYPE_CHECKING:
     from elpd.units import HostNs, Steps
 
 
-class Channel(Protocol):
-    """What a double asks instead of a device."""
-
-    def ask(self, call: str, /, *arguments: Any) -> Any:
-        """Return the answer to *call* (``device.method``), or raise what the device raised."""
-        ...
-
-    def ask_array(self, call: str, argument: NDArray[np.float64], /) -> NDArray[np.float64]:
-        """As ``ask``, for the one call that takes and returns an array."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class RigFacts:
-    """What is constant about a rig: its properties and which optional abilities each device has."""
-
-    geometry: Geometry
-    limits: LensLimits
-    capabilities: LensCapabilities
-    um_per_step: float
-    steps_to_um: tuple[tuple[float, float], ...]
-    opening_ms: float | None
-    min_latency_us: float | None
-    mark_channel: int | None
-    serials: dict[str, str]
-    outputs: tuple[str, ...]
-    abilities: dict[str, tuple[str, ...]]
-
-    @classmethod
-    def of(cls, parts: RigParts) -> RigFacts:
-        """Read every property of *parts* once. ``opening_ms`` is ``None`` where there is no aperture."""
-        devices = _devices(parts)
-        camera = parts.camera
-        return cls(
-            geometry=camera.geometry,
-            limits=parts.lens.limits,
-            capabilities=parts.lens.capabilities,
-            um_per_step=parts.um_per_step,
-            steps_to_um=parts.scale.table,
-            opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
-            min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
-            mark_channel=parts.lens.mark_channel if isinstance(parts.lens, TakesMarks) else None,
-            serials={name: device.serial for name, device in devices.items() if isinstance(device, Identified)},
-            outputs=tuple(parts.lens.outputs) if isinstance(parts.lens, Outputs) else (),
-            abilities={name: abilities_of(name, device) for name, device in devices.items()},
-        )
+def facts_of(parts: RigParts) -> RigFacts:
+    """Read every property of *parts* once. ``opening_ms`` is ``None`` where there is no aperture."""
+    devices = _devices(parts)
+    camera = parts.camera
+    return RigFacts(
+        geometry=camera.geometry,
+        limits=parts.lens.limits,
+        capabilities=parts.lens.capabilities,
+        um_per_step=parts.um_per_step,
+        steps_to_um=parts.scale.table,
+        opening_ms=None if parts.aperture is None else parts.aperture.opening_ms,
+        min_latency_us=camera.min_latency_us if isinstance(camera, Latency) else None,
+        mark_channel=parts.lens.mark_channel if isinstance(parts.lens, TakesMarks) else None,
+        serials={name: device.serial for name, device in devices.items() if isinstance(device, Identified)},
+        outputs=tuple(parts.lens.outputs) if isinstance(parts.lens, Outputs) else (),
+        abilities={name: abilities_of(name, device) for name, device in devices.items()},
+    )
 
 
 def build_doubles(facts: RigFacts, channel: Channel) -> RigParts:

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from elpd.record.codec import to_json
-from elpd.record.seams import RigFacts, build_doubles, methods_of
+from elpd.record.seams import build_doubles, facts_of, methods_of
 from elpd.records import CameraPacket, Encoding
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.ports import RigParts
+    from elpd.record.double import RigFacts
     from elpd.records import Frame, Geometry
 
 TAPE_FORMAT = 1
@@ -332,7 +333,7 @@ def tape_rig(parts: RigParts, tape: TapeWriter) -> RigParts:
     The answers are those of the true devices, passed on untouched; optional abilities appear exactly where the device
     has them. ``truth`` is handed through: no decision may depend on it, so it is not on the tape.
     """
-    facts = RigFacts.of(parts)
+    facts = facts_of(parts)
     tape.begin(facts, methods_of(parts))
     return replace(build_doubles(facts, tape), truth=parts.truth)
 

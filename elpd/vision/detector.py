@@ -16,9 +16,8 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from elpd.records import Direction
 
@@ -96,7 +95,7 @@ class Detector:
         variance = sum(energy for _, energy in self._differences)
         if variance <= 0.0:
             return self.rest.overdispersion
-        doubt = 1.0 + float(np.sqrt(2.0 / len(self._differences)))
+        doubt = 1.0 + sqrt(2.0 / len(self._differences))
         measured = doubt * sum(square for square, _ in self._differences) / variance
         return max(1.0, self.rest.overdispersion, measured)
 
@@ -209,4 +208,4 @@ class Detector:
 
 
 def _score(length: float, variance: float) -> float:
-    return length / float(np.sqrt(variance)) if variance > 0.0 else 0.0
+    return length / sqrt(variance) if variance > 0.0 else 0.0

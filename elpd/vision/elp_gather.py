@@ -11,7 +11,6 @@ from elpd.events.lanes_columns import SIXTEEN, column_and_polarity
 from elpd.events.simd import (
     HALF,
     I1,
-    I8,
     I32,
     I64,
     LONGS,
@@ -29,16 +28,10 @@ from elpd.events.simd import (
     splat,
     store,
 )
+from elpd.events.simd_lanes import fetch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-
-def _fetch(builder: Builder, index: Value, there: Value, table: Value) -> Value:
-    """Return the table's entries for sixteen events, of those that are *there*."""
-    pointer = builder.bitcast(table, I8.as_pointer())
-    arguments = [constant(HALF, 0), pointer, index, there, I32(2)]
-    return builder.trunc(call(builder, "llvm.x86.avx512.mask.gather.dpi.512", HALF, arguments), SIXTEEN)
 
 
 def _sum(
@@ -58,7 +51,7 @@ def _sum(
     with cgutils.for_range_slice(builder, I64(0), n, I64(16)) as (begin, _):
         there = lanes_left(builder, begin, n, HALF)
         index, is_on = events(begin)
-        entry = _fetch(builder, index, there, table)
+        entry = fetch(builder, table, index, there, SIXTEEN)
         inside = builder.and_(builder.icmp_signed(">", entry, largest), there)
         weight = builder.select(inside, entry, zero)
         wide = builder.sext(weight, HALF)

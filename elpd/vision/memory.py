@@ -39,9 +39,6 @@ MIN_EVENTS = 1_000
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
-MAINS_HZ = 250.0
-"""Lamps on mains flicker at 100 or 120 Hz; faster lines may be the grid of the time stamps themselves."""
-
 FIRST_CAPACITY = 1 << 17
 
 LEAST_ORDER = 0.75
@@ -325,8 +322,7 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        lamp = self.flicker()
-        if lamp is not None and lamp.frequency_hz < MAINS_HZ:
+        if self.flicker() is not None:
             # What makes pairs of bright pixels differ from those of dark ones is the lamp then, not the lag.
             brightness = start = None
         said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)

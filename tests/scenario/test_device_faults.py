@@ -15,7 +15,7 @@ CAMERA_BATCH_MS = 3.0
 
 @pytest.mark.parametrize("board", ["tic", "grbl"])
 @pytest.mark.parametrize("fault", ["camera_vanishes_at_s", "camera_silent_from_s"])
-@pytest.mark.parametrize("at_s", [0.02, 0.09, SWEEP_FROM_S + 0.01, SWEEP_FROM_S + 0.04, SWEEP_FROM_S + 0.06])
+@pytest.mark.parametrize("at_s", [0.0, 0.02, 0.09, SWEEP_FROM_S + 0.01, SWEEP_FROM_S + 0.04, SWEEP_FROM_S + 0.06])
 def test_a_camera_that_is_lost_stops_the_lens(board: str, fault: str, at_s: float) -> None:
     story = play(f"sim.board={board}", f"sim.{fault}={at_s}", "sim.seed=3")
     assert isinstance(story.error, CameraError)

@@ -81,6 +81,15 @@ def test_a_camera_that_is_lost_in_a_cycle_stops_the_lens(tmp_path: Path, key: st
     daemon.do("move", fraction=0.5)  # the lens was never lost: it knows where it is
 
 
+def test_a_camera_that_never_speaks_in_a_cycle_is_lost_not_a_mistake_of_the_program(tmp_path: Path) -> None:
+    """The aperture opens within milliseconds: before anybody could call the camera silent."""
+    daemon = Daemon(tmp_path, "sim.camera_silent_from_s=0", "service.look_every_s=1000").begin()
+    asked = daemon.until_answered(daemon.ask("focus"))
+    assert asked.kind == "CameraError"
+    assert daemon.status.fault is not None
+    assert "check its cable" in daemon.status.fault.message
+
+
 def test_a_camera_that_falls_silent_while_idle_is_a_fault(tmp_path: Path) -> None:
     daemon = Daemon(tmp_path, "sim.camera_silent_from_s=0.2", "service.look_every_s=0").begin()
     daemon.until(lambda: daemon.status.state == "FAULT", 5.0)

@@ -14,13 +14,14 @@ import pytest
 from benchmarks import runner
 from benchmarks.calibration import calibrations, draw_calibration, half_normal_quantiles
 from benchmarks.executors import edition
-from benchmarks.goals import MET, NOT_MET, SO_FAR, UNMEASURED, Verdict, tell, verdicts
+from benchmarks.goals import verdicts
 from benchmarks.limit import SignLimit, sign_sigma_um
 from benchmarks.live import read_live
 from benchmarks.methods import Row
 from benchmarks.retina import RetinaEvents
 from benchmarks.runner import Task
 from benchmarks.shutter import Shutter
+from benchmarks.verdict import MET, NOT_MET, SO_FAR, UNMEASURED, Verdict, tell
 
 from elpd.errors import FormatError
 from elpd.records import Roi

@@ -1,4 +1,4 @@
-"""A stepper iris on the second axis of the lens's controller, from the wire to the light."""
+"""A stepper iris on another axis of the lens's controller, from the wire to the light."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from elpd.rig import build
 
 STEPS, SPEED_SPS = 4800, 12_800.0
 WAY_MS = 1000 * STEPS / SPEED_SPS
-TABLE = {"iris_axis": 2, "iris_open": STEPS, "iris_speed_sps": SPEED_SPS}
+AXES = {"zaber": 2, "tmcl": 1, "scf4": "C"}
+everywhere = pytest.mark.parametrize("kind", AXES)
 
 
-def with_iris(**more: Any) -> tuple[Rig, StepperIris]:
-    made, iris = rig("zaber"), StepperIris(STEPS, at_steps=STEPS / 2)
+def with_iris(kind: str = "zaber", **more: Any) -> tuple[Rig, StepperIris]:
+    made, iris = rig(kind), StepperIris(STEPS, at_steps=STEPS / 2)
     made.board.add_iris(iris)
-    made.open(**{**TABLE, **more})
+    made.open(**{"iris_axis": AXES[kind], "iris_open": STEPS, "iris_speed_sps": SPEED_SPS, **more})
     return made, iris
 
 
@@ -31,8 +32,9 @@ def steps_of(iris: StepperIris, made: Rig) -> float:
     return float(iris.steps_at(made.clock.now_ns()))
 
 
-def test_closing_for_the_first_time_homes_it_and_opening_takes_its_time() -> None:
-    made, iris = with_iris()
+@everywhere
+def test_closing_for_the_first_time_homes_it_and_opening_takes_its_time(kind: str) -> None:
+    made, iris = with_iris(kind)
     aperture = aperture_on_lens({"output": "iris", "opening_ms": 600}, made.lens)
     with pytest.raises(LensError, match="close it first"):
         aperture.open()
@@ -51,8 +53,9 @@ def test_closing_for_the_first_time_homes_it_and_opening_takes_its_time() -> Non
     assert steps_of(iris, made) == 0.0
 
 
-def test_the_lens_moves_and_is_watched_while_it_turns() -> None:
-    made, iris = with_iris()
+@pytest.mark.parametrize("kind", ["zaber", "tmcl"])
+def test_the_lens_moves_and_is_watched_while_it_turns(kind: str) -> None:
+    made, iris = with_iris(kind)
     made.lens.set_output("iris", on=False)
     made.lens.move_to(4800, 6000.0)
     made.live(600)
@@ -82,10 +85,90 @@ def test_a_fault_of_its_axis_is_named() -> None:
         made.live(50)
 
 
+@everywhere
+def test_it_is_driven_no_further_than_its_stop_and_both_ways_from_wherever_it_was(kind: str) -> None:
+    for begin in (0.0, 1.0):
+        made, iris = rig(kind), StepperIris(STEPS, at_steps=begin * STEPS)
+        made.board.add_iris(iris)
+        made.open(iris_axis=AXES[kind], iris_open=STEPS - 400, iris_speed_sps=SPEED_SPS)
+        for on, place in ((False, 0.0), (True, STEPS - 400), (False, 0.0), (True, STEPS - 400)):
+            made.lens.set_output("iris", on=on)
+            made.live(600)
+            assert steps_of(iris, made) == pytest.approx(place, abs=0.5)
+
+
+def test_a_motor_whose_driver_is_too_hot_is_named() -> None:
+    made, _ = with_iris("tmcl")
+    made.lens.set_output("iris", on=False)
+    made.live(600)
+    made.board.iris_flags = 2
+    with pytest.raises(LensError, match="the iris's motor driver stopped: too hot"):
+        made.lens.set_output("iris", on=True)
+
+
+def test_a_module_without_that_motor_says_so() -> None:
+    with pytest.raises(LensError, match=r"has no motor 1 \(lens.iris_axis; it answers with status 4, invalid value"):
+        rig("tmcl").open(iris_axis=1, iris_open=STEPS, iris_speed_sps=SPEED_SPS)
+
+
+def test_on_an_scf4_it_turns_at_rest_only_and_a_count_that_is_wrong_is_a_fault() -> None:
+    made, iris = with_iris("scf4")
+    made.lens.set_output("iris", on=False)
+    with pytest.raises(LensError, match="the iris still turns"):
+        made.lens.set_output("iris", on=True)
+    made.live(600)
+    made.lens.move_to(4800, 6000.0)
+    with pytest.raises(LensError, match="while the lens rests only"):
+        made.lens.set_output("iris", on=True)
+    made.live(600)
+    assert made.rotor == pytest.approx(4800.0)
+    stands = steps_of(iris, made)
+    made.lens.set_output("iris", on=False)
+    made.live(20)
+    assert steps_of(iris, made) == stands, "it is there already"
+    made.board.iris_motor.set_count(made.clock.now_ns(), 7)
+    with pytest.raises(LensError, match="the iris's motor C stands at 7 instead of 32000"):
+        made.live(20)
+
+
+def test_on_an_scf4_nothing_turns_before_homing_has_found_out_how_it_counts() -> None:
+    made, iris = with_iris("scf4", trust_position=False, relative="", speed_scale=None)
+    with pytest.raises(LensError, match="home it first"):
+        made.lens.set_output("iris", on=False)
+    made.lens.home(made.soon(30_000))
+    made.lens.set_output("iris", on=False)
+    made.live(600)
+    assert steps_of(iris, made) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "words"),
+    [
+        ("zaber", "2", "iris_axis is '2'; it is one of 2, 3"),
+        ("zaber", 0, "it is one of 2, 3"),
+        ("tmcl", 0, "the lens's own axis"),
+        ("tmcl", 7, "it is one of 1, 2, 3, 4, 5"),
+        ("scf4", "A", "the lens's own axis"),
+        ("scf4", "AB", "it is one of 'B', 'C'"),
+        ("scf4", 2, "it is one of 'B', 'C'"),
+    ],
+)
+def test_axes_that_a_controller_does_not_have_are_refused(kind: str, axis: object, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        with_iris(kind, iris_axis=axis)
+
+
+def test_a_speed_that_a_motion_controller_cannot_make_is_refused() -> None:
+    made = rig("tmcl", module=1140)
+    made.board.add_iris(StepperIris(STEPS))
+    with pytest.raises(ConfigError, match="the divisors of motor 1 allow"):
+        made.open(iris_axis=1, iris_open=STEPS, iris_speed_sps=1e6)
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"iris_axis": 0}, "need lens.iris_axis"),
+        ({"iris_axis": None}, "need lens.iris_axis"),
         ({"iris_axis": 1}, "the lens's own axis"),
         ({"iris_open": 0}, "both 0 steps"),
         ({"iris_speed_sps": 0.0}, r"iris_speed_sps is 0; give steps/s"),
@@ -100,7 +183,7 @@ def test_tables_that_cannot_be_are_refused(table: dict[str, Any], words: str) ->
 
 def test_a_device_with_one_axis_says_so() -> None:
     with pytest.raises(LensError, match="BADAXIS"):
-        rig("zaber").open(**TABLE)
+        rig("zaber").open(iris_axis=2, iris_open=STEPS, iris_speed_sps=SPEED_SPS)
 
 
 def test_what_it_passes_grows_from_dead_band_to_dead_band() -> None:
@@ -115,9 +198,10 @@ def test_what_it_passes_grows_from_dead_band_to_dead_band() -> None:
         StepperIris(0)
 
 
-def test_the_simulated_rig_has_one_on_its_board() -> None:
+@everywhere
+def test_the_simulated_rig_has_one_on_its_board(kind: str) -> None:
     small = ["sim.width=32", "sim.height=32", "state.profiles=false", "sim.iris_steps=4800"]
-    parts = build(load(overrides=[*small, "sim.board=zaber"]))
+    parts = build(load(overrides=[*small, f"sim.board={kind}"]))
     assert parts.aperture is not None
     assert parts.aperture.opening_ms == pytest.approx(520.0)
     assert parts.aperture.close().command == "iris off"

@@ -11,8 +11,9 @@ from elpd_drivers.lenses.motor import CONFIRMATIONS, Motor
 from hypothesis import given
 from hypothesis import strategies as st
 
+from elpd.motion.commanded import Motion
 from elpd.motion.lessons import Lessons, Sensitivity
-from elpd.motion.trajectory import HELD_UP_NS, Motion, Timing, Trajectory
+from elpd.motion.trajectory import HELD_UP_NS, Timing, Trajectory
 from elpd.records import LensFlag, LensReport
 from elpd.units import HostNs
 

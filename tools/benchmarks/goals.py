@@ -2,15 +2,13 @@
 
 Every verdict is computed from rows. ``met`` and ``not met`` need every sweep that the goal is about. On some of them a
 mean holds or does not hold *so far*, while one answer that must never be given is enough to break a goal. What nobody
-measured says so. Rows of the benchmark are the detector's on
-recorded sweeps: an estimate, causal, without a lens to stop. What a lens did comes from ``tools/acceptance.py`` and
-stands beside it under the run's name.
+measured says so. Rows of the benchmark are the detector's on recorded sweeps: an estimate, causal, without a lens to
+stop. What a lens did comes from ``tools/acceptance.py`` and stands beside it under the run's name.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +16,16 @@ from benchmarks.cases import cases_of
 from benchmarks.methods import NO_FRAMES, OURS
 from benchmarks.published import SYN_MAE_UM, published_mae_um, rerun_mae_um
 from benchmarks.sets import E2VID, MAP, REBUILT, SETS
+from benchmarks.verdict import (
+    ABSTAIN_SHARE,
+    ABSTAIN_SHARE_SHAKE,
+    EARLY_SHARE,
+    TRIALS,
+    Accuracy,
+    Verdict,
+    direction_state,
+    state,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -25,51 +33,9 @@ if TYPE_CHECKING:
     from benchmarks.live import LiveRun
     from benchmarks.methods import Row
 
-MET, NOT_MET, UNMEASURED = "met", "not met", "not measured"
-SO_FAR = " so far"
 OFFLINE = "recorded sweeps"
 BESIDE = ("egs", "pbf", "esva", "elp-syn", "elp-syn-1fps", "elp-davis", "elp-evk4")
 """The peers whose means on the same sweeps stand beside ours."""
-
-TRIALS = 200
-EARLY_SHARE = 0.02
-ABSTAIN_SHARE, ABSTAIN_SHARE_SHAKE = 0.05, 0.10
-ONE_WAY_MS = 100.0
-
-
-@dataclass(frozen=True, slots=True)
-class Accuracy:
-    """A goal for the mean error on one set, motion and frame rate; beside it the paper's claim, if it is another."""
-
-    set_name: str
-    motion: str
-    rate: str
-    mae_um: float
-    claim: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """A line of the table: the goal, who measured it on how many of how many trials, what, and what others have."""
-
-    goal: str
-    source: str
-    trials: int
-    wanted: int
-    mae_um: float | None = None
-    worst_um: float | None = None
-    missed: int | None = None
-    abstained_share: float | None = None
-    outside: int | None = None
-    early: int | None = None
-    other: str = ""
-    beside: str = ""
-    verdict: str = UNMEASURED
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the line as plain data."""
-        return asdict(self)
-
 
 _HINDSIGHT_DAVIS, _HINDSIGHT_EVK4 = "paper: ELP 0.29 in hindsight", "paper: ELP 0.57 in hindsight"
 ACCURACY = (
@@ -116,47 +82,6 @@ def verdicts(rows: Sequence[Row], live: Sequence[LiveRun] = ()) -> list[Verdict]
             Verdict("200 um to rest within 100 ms at 4 mm/s (160 with two crossings)", "tools/acceptance.py", 0, 1)
         )
     return table
-
-
-def state(*, over: bool, trials: int, wanted: int, broken: bool = False) -> str:
-    """Return the verdict in words.
-
-    *over* says that a mean or a share is over its limit, which more trials may change; *broken* what none can mend.
-    """
-    if trials == 0:
-        return UNMEASURED
-    if broken:
-        return NOT_MET
-    return (NOT_MET if over else MET) + ("" if trials >= wanted else SO_FAR)
-
-
-def direction_state(wrong: int, allowed: int, trials: int) -> str:
-    """Return the verdict on directions: so many wrong of so many, in proportion where there are more than 200."""
-    over = wrong > allowed * max(1.0, trials / TRIALS)
-    return state(over=over, broken=over and allowed == 0, trials=trials, wanted=TRIALS)
-
-
-def tell(table: Sequence[Verdict]) -> list[str]:
-    """Return the table as lines of text."""
-    lines = []
-    for one in table:
-        parts = [f"{one.verdict:14s} {one.goal}"]
-        if one.trials:
-            parts.append(f"{one.source}, {one.trials} of {one.wanted}: {measured(one)}")
-        lines.append("  ".join(parts))
-    return lines
-
-
-def measured(one: Verdict) -> str:
-    """Return what was measured, in words."""
-    numbers = {"MAE {:.2f} um": one.mae_um, "worst {:.2f} um": one.worst_um, "{} without answer": one.missed or None}
-    numbers |= {
-        "{:.1%} abstained": one.abstained_share,
-        "{} OUTSIDE": one.outside or None,
-        "{} early": one.early or None,
-    }
-    told = [words.format(value) for words, value in numbers.items() if value is not None]
-    return ", ".join([*told, one.other] if one.other else told) or "nothing to report"
 
 
 def _rows_of(goal: Accuracy, rows: Iterable[Row]) -> list[Row]:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.goals import (
+from benchmarks.sets import SETS
+from benchmarks.verdict import (
     ABSTAIN_SHARE,
     ABSTAIN_SHARE_SHAKE,
     EARLY_SHARE,
@@ -24,7 +25,6 @@ from benchmarks.goals import (
     direction_state,
     state,
 )
-from benchmarks.sets import SETS
 from elpd.errors import FormatError
 
 if TYPE_CHECKING:

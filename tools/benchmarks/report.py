@@ -10,20 +10,21 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.calibration import BEYOND_TWO_SIGMA, draw_calibration
-from benchmarks.goals import MET, NOT_MET, UNMEASURED, measured, rate_name
+from benchmarks.goals import rate_name
 from benchmarks.methods import OURS, all_methods
 from benchmarks.plots import Plot, Series, draw
 from benchmarks.sets import MAP, REBUILT, SETS
+from benchmarks.verdict import MET, NOT_MET, UNMEASURED, measured
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     from benchmarks.calibration import Calibration
-    from benchmarks.goals import Verdict
     from benchmarks.methods import Row
     from benchmarks.scoring import Score
     from benchmarks.sets import CaseSet
+    from benchmarks.verdict import Verdict
 
 PLOTTED = (
     (OURS, "50"),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from elpd.records import Geometry
 
-NO_SIMD = "this processor has no AVX-512"
+NO_SIMD = "this processor has neither AVX-512 nor AVX2"
 SQUARE = 400
 CAMERA_DTYPE = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])  # 13 bytes, as neuromorphic-drivers
 SOME_WORDS = 6_000_000

@@ -81,6 +81,8 @@ def check_target(target: int, limits: LensLimits) -> None:
 
 def check_output(name: str, outputs: Sequence[str]) -> None:
     """Refuse an output that the controller does not have. Raises ``UsageError``."""
+    if not outputs:
+        raise UsageError("lens: this controller has no outputs that it can be told to switch")
     if name not in outputs:
         raise UsageError(f"lens: no output is called {name!r}; this controller has {', '.join(outputs)}")
 

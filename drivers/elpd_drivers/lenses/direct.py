@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from elpd.errors import LensError, UsageError
-from elpd.motion.trajectory import REST, Motion
+from elpd.errors import LensError
+from elpd.motion.commanded import REST, Motion
 from elpd.records import CommandStamp, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, after_ms
 from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target, with_measured_stop
@@ -322,9 +322,8 @@ class DirectLens:
     def set_output(self, name: str, *, on: bool) -> CommandStamp:
         """Switch one of the controller's outputs."""
         controller = self._controller
-        if not isinstance(controller, Switching):
-            raise UsageError("lens: this controller has no outputs that it can be told to switch")
-        check_output(name, controller.outputs)
+        check_output(name, self.outputs)
+        assert isinstance(controller, Switching), "it has that output"
         with self._guarded():
             sent = controller.switch(name, on=on)
         return CommandStamp(f"{name} {'on' if on else 'off'}", sent.begun_ns, sent.done_ns)

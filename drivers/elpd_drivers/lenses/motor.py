@@ -16,7 +16,8 @@ from elpd.units import NS_PER_MS, HostNs
 from elpd_drivers.lenses.line import Trouble
 
 if TYPE_CHECKING:
-    from elpd.motion.trajectory import Motion, Timing
+    from elpd.motion.commanded import Motion
+    from elpd.motion.trajectory import Timing
     from elpd.records import PositionEstimate
 
 CONFIRMATIONS = 3

@@ -19,24 +19,27 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import structlog
 
 from elpd.errors import ConfigError, LensError
-from elpd.motion.trajectory import Motion, Timing
+from elpd.motion.commanded import Motion
+from elpd.motion.trajectory import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import scf4_wire as wire
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.direct import DirectLens, Going, Latency, Reading
-from elpd_drivers.lenses.line import Trouble, open_on_line
+from elpd_drivers.lenses.iris_axis import IRIS, iris_axis
+from elpd_drivers.lenses.line import Sent, Trouble, open_on_line
 from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
 from elpd_drivers.lenses.scf4_homing import Homing, Seen
+from elpd_drivers.lenses.scf4_iris import Scf4Iris
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Mapping
+    from collections.abc import Callable, Generator, Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
-    from elpd_drivers.lenses.line import Line, Sent
+    from elpd_drivers.lenses.line import Line
     from elpd_drivers.lenses.scf4_homing import Found
 
 T = TypeVar("T")
@@ -56,9 +59,11 @@ class Scf4Settings:
     ``pi_above`` is what the photo-interrupter reads above that. ``relative`` ("G90" or "G91") and ``speed_scale``
     (steps per second, times the code of ``M240``) are found out when the lens is homed, unless given, and then checked.
     With ``trust_position``, which needs both, an earlier session's homing is good enough, as long as the board has had
-    power since. ``acceleration_um_s2`` is how it starts and stops, if not at once. ``baud`` does not matter to the
-    board. ``latency_us`` is the usual time from a command's last bit to its effect, USB included, and
-    ``latency_sigma_us`` how well that is known; unless given, a real port gets what USB adapters need.
+    power since. With ``iris_axis`` another motor ("B" or "C") turns a stepper iris, which is the output "iris" then:
+    between ``iris_closed`` (its closed stop) and ``iris_open``, steps, at ``iris_speed_sps``. ``acceleration_um_s2`` is
+    how the lens starts and stops, if not at once. ``baud`` does not matter to the board. ``latency_us`` is the usual
+    time from a command's last bit to its effect, USB included, and ``latency_sigma_us`` how well that is known; unless
+    given, a real port gets what USB adapters need.
     """
 
     port: str = ""
@@ -76,6 +81,10 @@ class Scf4Settings:
     reply_ms: float = 60.0
     latency_us: float = 300.0
     latency_sigma_us: float = 120.0
+    iris_axis: str | None = None
+    iris_closed: int = 0
+    iris_open: int = 0
+    iris_speed_sps: float = 0.0
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> DirectLens:
@@ -127,6 +136,8 @@ class Scf4Controller:
         self._asked_off_ns = 0
         self._errand: Generator[None, Seen, Found] | None = None
         self._trusted = False
+        self._iris_axis = iris_axis(settings, wire.LENS_MOTOR, wire.MOTORS)
+        self._iris = None if self._iris_axis is None else Scf4Iris(line, self._iris_axis)
 
     @property
     def capabilities(self) -> LensCapabilities:
@@ -163,6 +174,8 @@ class Scf4Controller:
             self._await(lambda line: True if line == "OK" else None, "$B2")
             self._relative, self._speed_scale = "", None
         self._count = None
+        if self._iris is not None:
+            self._iris.forget()
 
     def referenced(self) -> bool:
         """Whether an earlier session has homed the lens, and is trusted to have."""
@@ -264,6 +277,26 @@ class Scf4Controller:
     def _say(self, text: str) -> None:
         self._line.send(wire.order(text))
 
+    # --- outputs ---------------------------------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """A stepper iris on another motor, if there is one."""
+        return () if self._iris is None else (IRIS,)
+
+    def switch(self, name: str, *, on: bool) -> Sent:
+        """Send the iris on its way, while the lens rests."""
+        del name
+        assert self._iris is not None, "there is no other output"
+        assert self._iris_axis is not None, "they come together"
+        if self._speed_scale is None or not self._relative:
+            raise LensError("lens: how this SCF4 counts and how fast it is are found out by homing; home it first")
+        if self._motor.under_way:
+            raise LensError("lens: an SCF4's iris is turned while the lens rests only; wait until it stands")
+        sent = self._iris.turn(self._code_for(self._iris_axis.speed_sps), self._relative, opened=on)
+        now = self._clock.now_ns()
+        return Sent(now, now, now) if sent is None else sent
+
     # --- homing ----------------------------------------------------------------------------------------------------
 
     def begin_homing(self) -> None:
@@ -306,6 +339,8 @@ class Scf4Controller:
             status = wire.parse_status(line)
             if status is None or not self.asking.open:
                 continue
+            if self._iris is not None:
+                self._iris.heed(line, self._asked_off_ns)
             self.asking.answered()
             latest_ns = max(self._line.by_ns - (len(line) + 2 + behind) * self._line.byte_ns, self._asked_off_ns)
             near = status.count if self._count is None else self._count

@@ -1,4 +1,4 @@
-"""The lines of Kurokesu's SCF4: what is said to motor A, and how its replies read. Pure functions.
+"""The lines of Kurokesu's SCF4: what is said to its motors, and how its replies read. Pure functions.
 
 From the maker's page of commands and the examples of the SDK, which disagree in places: what they disagree on is
 found out on the device (``scf4_homing``).
@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+MOTORS = ("A", "B", "C")
+LENS_MOTOR = "A"
 STATUS = b"!1\n"
 STOP = b"M0 A\n"
 VERSION = b"$S\n"
@@ -29,7 +31,7 @@ _STATUS = re.compile(r" *\d{1,5}( *, *\d{1,5}){8} *")
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Motor A: its counter (0 to 65535), whether its photo-interrupter reads 1, and whether it moves."""
+    """A motor: its counter (0 to 65535), whether its photo-interrupter reads 1, and whether it moves."""
 
     count: int
     interrupter: bool
@@ -41,14 +43,15 @@ def order(text: str) -> bytes:
     return f"{text}\n".encode("ascii")
 
 
-def parse_status(line: str) -> Status | None:
-    """Read the reply to ``!1``; None for anything else."""
+def parse_status(line: str, motor: str = LENS_MOTOR) -> Status | None:
+    """Read what the reply to ``!1`` says of a motor; None for anything else."""
     if not _STATUS.fullmatch(line):
         return None
     numbers = [int(part) for part in line.split(",")]
     if max(numbers[:3]) >= WRAP or max(numbers[3:]) > 1:
         return None
-    return Status(numbers[0], bool(numbers[3]), bool(numbers[6]))
+    at = MOTORS.index(motor)
+    return Status(numbers[at], bool(numbers[3 + at]), bool(numbers[6 + at]))
 
 
 def parse_version(line: str) -> tuple[str, str] | None:

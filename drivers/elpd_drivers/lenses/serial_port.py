@@ -1,12 +1,15 @@
 """A serial line as a ``BytePort``: exclusive, never waiting, one system call per write.
 
 pyserial opens and configures the line (it knows every platform's quirks); reading and writing then go past it, because
-its ``write`` costs a select and its timeouts are for people who wait. A stop byte is one ``os.write``. Two locks keep
-a second program out: an advisory ``flock`` and ``TIOCEXCL``, which also stops those who do not ask.
+its ``write`` costs a select and its timeouts are for people who wait. A stop byte is one ``write`` of the C library,
+called without letting go of the interpreter: ``os.write`` lets another thread have it first, and waits until that
+thread runs if it has asked, which on a busy machine takes milliseconds. The line never blocks, so nobody waits for it.
+Two locks keep a second program out: an advisory ``flock`` and ``TIOCEXCL``, which also stops those who do not ask.
 """
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 import os
@@ -20,6 +23,10 @@ import serial
 from elpd.errors import BusyError, ConfigError, ElpdError, LensError
 
 WRITE_TIMEOUT_S = 0.05
+
+_write = ctypes.PyDLL(None, use_errno=True).write  # PyDLL, unlike CDLL, keeps the interpreter while it calls
+_write.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t)
+_write.restype = ctypes.c_ssize_t
 
 
 class SerialPort:
@@ -58,12 +65,12 @@ class SerialPort:
     def write(self, data: bytes) -> None:
         """Hand *data* to the kernel, in one call unless its buffer is full (then within the write timeout)."""
         descriptor = self._open()
-        try:
-            sent = os.write(descriptor, data)
-        except BlockingIOError:
+        sent = int(_write(descriptor, data, len(data)))
+        if sent < 0:
+            code = ctypes.get_errno()
+            if code not in {errno.EAGAIN, errno.EINTR}:
+                raise self._gone("write to", OSError(code, os.strerror(code)))
             sent = 0
-        except OSError as error:
-            raise self._gone("write to", error) from None
         if sent < len(data):
             self._write_rest(descriptor, data[sent:])
 

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, LensError, UsageError
-from elpd.motion.trajectory import Motion, Timing
+from elpd.motion.commanded import Motion
+from elpd.motion.trajectory import Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensLimits, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses import theia_wire as wire

@@ -18,15 +18,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, LensError
-from elpd.motion.trajectory import Motion, Timing
+from elpd.motion.commanded import Motion
+from elpd.motion.trajectory import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import tmcl_wire as wire
 from elpd_drivers.lenses.asking import Asking
 from elpd_drivers.lenses.axis import limits_from
 from elpd_drivers.lenses.direct import DirectLens, Going, Latency, Reading
+from elpd_drivers.lenses.iris_axis import IRIS
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.motor import Motor
+from elpd_drivers.lenses.tmcl_iris import tmcl_iris
 from elpd_drivers.lenses.tmcl_talk import LOOK_MS, Talk, TmclSettings, identify, learn_units, refusal
 
 if TYPE_CHECKING:
@@ -73,6 +76,7 @@ class TmclController:
         )
         self.limits = self._wanted
         self._talk = Talk(settings, clock, line)
+        self._iris = tmcl_iris(self._talk)
         self.asking = Asking(settings.query_ms, settings.reply_ms)
         stop = self._talk.frame(wire.MST)
         self._stopping = {StopMode.ABRUPT: stop, StopMode.RAMPED: stop}
@@ -145,6 +149,8 @@ class TmclController:
             if self._clock.now_ns() >= due:
                 raise LensError(f"lens port {self._line.name}: the motor does not stop; switch the module off and on")
         self._marked = self._talk.exchange(wire.GGP, MARK_VARIABLE, motor=wire.USER_BANK) == REFERENCED_MARK
+        if self._iris is not None:
+            self._iris.meet()
 
     def referenced(self) -> bool:
         """Whether the mark of an earlier homing is still there: the module had power ever since."""
@@ -224,12 +230,14 @@ class TmclController:
 
     @property
     def outputs(self) -> Sequence[str]:
-        """The module's general purpose outputs; it refuses those that it does not have."""
-        return OUTPUTS
+        """The module's general purpose outputs (it refuses those that it does not have), and an iris on a motor."""
+        return OUTPUTS if self._iris is None else (IRIS, *OUTPUTS)
 
     def switch(self, name: str, *, on: bool) -> Sent:
         """Switch an output, and wait for the reply: no other command may be sent before it."""
         self._settle()
+        if self._iris is not None and name == IRIS:
+            return self._iris.turn(opened=on)
         port = int(name.removeprefix("out"))
         sent = self._line.send(self._talk.frame(wire.SIO, port, int(on), motor=wire.OUTPUT_BANK))
         self._talk.confirm(wire.SIO)

@@ -27,7 +27,9 @@ class TmclSettings:
     """The table ``[lens]`` for a TMCL module.
 
     ``address`` is the module's, ``host`` the one that it replies to, ``motor`` the axis. ``module`` is needed only for
-    a module that this driver does not know by number. ``home_um_s`` and ``switch_um_s`` are the speeds of the search
+    a module that this driver does not know by number. With ``iris_axis`` another of its motors turns a stepper iris,
+    which is the output "iris" then: between ``iris_closed`` (its closed stop) and ``iris_open``, microsteps, at
+    ``iris_speed_sps``. ``home_um_s`` and ``switch_um_s`` are the speeds of the search
     for the left switch and of leaving it. ``latency_us`` is the usual time from a command's last bit to its effect,
     adapter included, and ``latency_sigma_us`` how well that is known; unless given, a real port gets what USB needs.
     """
@@ -49,6 +51,10 @@ class TmclSettings:
     reply_ms: float = 100.0
     latency_us: float = 250.0
     latency_sigma_us: float = 100.0
+    iris_axis: int | None = None
+    iris_closed: int = 0
+    iris_open: int = 0
+    iris_speed_sps: float = 0.0
 
 
 class Talk:
@@ -150,9 +156,9 @@ def identify(talk: Talk) -> None:
     )
 
 
-def learn_units(talk: Talk) -> wire.Units:
-    """Ask for the divisors of a TMC429; modules without them count in pulses per second."""
-    pulse = talk.attempt(wire.GAP, wire.PULSE_DIVISOR)
+def learn_units(talk: Talk, motor: int | None = None) -> wire.Units:
+    """Ask for the divisors of a motor's TMC429; modules without them count in pulses per second."""
+    pulse = talk.attempt(wire.GAP, wire.PULSE_DIVISOR, motor=motor)
     if pulse.status != wire.OK:
         return wire.Units()
-    return wire.Units(pulse.value, talk.exchange(wire.GAP, wire.RAMP_DIVISOR))
+    return wire.Units(pulse.value, talk.exchange(wire.GAP, wire.RAMP_DIVISOR, motor=motor))

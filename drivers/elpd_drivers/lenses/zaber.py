@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, LensError
-from elpd.motion.trajectory import Motion, Timing
+from elpd.motion.commanded import Motion
+from elpd.motion.trajectory import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, Steps, after_ms
 from elpd_drivers.lenses import zaber_wire as wire
@@ -68,7 +69,7 @@ class ZaberSettings:
     reply_ms: float = 60.0
     latency_us: float = 300.0
     latency_sigma_us: float = 120.0
-    iris_axis: int = 0
+    iris_axis: int | None = None
     iris_closed: int = 0
     iris_open: int = 0
     iris_speed_sps: float = 0.0
@@ -114,7 +115,7 @@ class ZaberController:
         self._asked_off_ns = 0
         self._orders: set[int] = set()
         self._busy = self._referenced = False
-        self._iris = iris_axis(settings, settings.axis)
+        self._iris = iris_axis(settings, settings.axis, range(1, 10))
         self._iris_referenced = False
 
     @property
@@ -251,7 +252,7 @@ class ZaberController:
     def _ours(self, line: str) -> wire.Reply | None:
         """Read a line that is this lens's, or its iris's; once a reply had a checksum, all must."""
         reply = wire.parse_reply(line, checked_only=self._checked_only)
-        ours = {0, self._settings.axis, self._settings.iris_axis}
+        ours = {0, self._settings.axis, 0 if self._iris is None else self._iris.axis}
         if reply is None or reply.device != self._settings.device or reply.axis not in ours:
             return None
         self._checked_only = self._checked_only or (reply.checked and reply.number is not None)
@@ -306,7 +307,7 @@ class ZaberController:
         self._orders.add(number)
         return self._line.send(wire.command(self._settings.device, axis, words, number))
 
-    def _meet_iris(self, iris: IrisAxis) -> None:
+    def _meet_iris(self, iris: IrisAxis[int]) -> None:
         """See that the iris's axis is there, can reach both places, and whether it knows where it is."""
         low, high = (self._iris_number(iris, f"limit.{end}") for end in ("min", "max"))
         for name, steps in (("iris_closed", iris.closed_steps), ("iris_open", iris.open_steps)):
@@ -322,18 +323,16 @@ class ZaberController:
                 "at the most (its maxspeed); change one of them"
             )
 
-    def _iris_number(self, iris: IrisAxis, setting: str) -> float:
+    def _iris_number(self, iris: IrisAxis[int], setting: str) -> float:
         reply = self._exchange(f"get {setting}", axis=iris.axis)
         self._iris_referenced = reply.flag not in wire.NOT_REFERENCED
         return float(reply.data)
 
-    def _turn_iris(self, iris: IrisAxis, *, opened: bool) -> Sent:
+    def _turn_iris(self, iris: IrisAxis[int], *, opened: bool) -> Sent:
         """Open or close it. The first closing since power-up is the homing of its axis, to its closed end."""
         if not self._iris_referenced:
             if opened:
-                raise LensError(
-                    f"lens: axis {iris.axis} does not know where the iris is; close it first, that homes it"
-                )
+                raise iris.unknown()
             self._iris_referenced = True
             return self._order(iris.axis, "home")
         units = max(1, math.floor(iris.speed_sps * wire.SPEED_PER_SPS + 1e-6))

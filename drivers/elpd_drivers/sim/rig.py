@@ -24,7 +24,7 @@ from elpd.records import Encoding, Geometry, LensReport, Roi, Trigger
 from elpd.scale import LensScale
 from elpd.units import Steps, after_ms
 from elpd_drivers.lenses.axis import read_settings
-from elpd_drivers.lenses.iris_axis import IRIS
+from elpd_drivers.lenses.iris_axis import INTO_STOP, IRIS
 from elpd_drivers.sim.aperture import Opening, SimulatedAperture, StepperIris
 from elpd_drivers.sim.camera import RING_PACKETS, ArrayWire, CameraFaults, RateLimit, SimulatedCamera, TriggerLine, Wire
 from elpd_drivers.sim.controllers import Wanted, controller, fitted
@@ -68,10 +68,10 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in. With ``iris_steps`` the aperture is an iris on the second axis of the lens's board (Zaber's), with so
-    many microsteps from stop to stop, turned at ``iris_speed_sps``. Focus moves along the travel by ``drift_um_s``.
-    With ``sync_steps`` the board's sync line, which makes an edge at every multiple of so many steps, is wired to the
-    camera's trigger input, unless ``sync_cut``.
+    believes in. With ``iris_steps`` the aperture is an iris on another axis of the lens's board (scf4, tmcl or
+    zaber), with so many microsteps from stop to stop, turned at ``iris_speed_sps``. Focus moves along the
+    travel by ``drift_um_s``. With ``sync_steps`` the board's sync line, which makes an edge at every multiple of so
+    many steps, is wired to the camera's trigger input, unless ``sync_cut``.
 
     Misfortunes: ``flicker_shape`` is ``sine`` or ``pwm``. ``pan_px_s`` is a steady motion, ``pan_deg`` its direction
     from the x axis; ``breathing_per_mm`` how the magnification changes with travel. With ``second_plane_um`` the right
@@ -149,7 +149,9 @@ IRIS_HOMING_MS, IRIS_SPARE_MS = 500.0, 20.0
 
 @runtime_checkable
 class TurnsIris(Protocol):
-    """A board with an axis for an iris."""
+    """A board with an axis for an iris, and what its driver calls that axis."""
+
+    iris_axis: int | str
 
     def add_iris(self, iris: StepperIris) -> None:
         """Put it there."""
@@ -417,10 +419,11 @@ def _lens(
     if iris is not None:
         if not isinstance(port.wire.board, TurnsIris):
             raise ConfigError(
-                f"sim.iris_steps: the board {chosen.board!r} has no second axis here; sim.board=zaber has"
+                f"sim.iris_steps: the board {chosen.board!r} has no second axis here; scf4, tmcl and zaber have"
             )
         port.wire.board.add_iris(iris)
-        table = {**table, "iris_axis": 2, "iris_open": chosen.iris_steps, "iris_speed_sps": chosen.iris_speed_sps}
+        table = {**table, "iris_axis": port.wire.board.iris_axis, "iris_open": chosen.iris_steps}
+        table["iris_speed_sps"] = chosen.iris_speed_sps
     lens = controller(chosen.board).open_lens(table, world, port)
     if not lens.capabilities.stop_on_command:  # nor does such a controller remember where it is: as a person would
         here = Steps(round(mechanism.rotor_at(world.now_ns())))
@@ -450,8 +453,8 @@ def _aperture(chosen: SimSettings, world: World) -> SimulatedAperture:
 
 
 def _iris_on(lens: Lens, chosen: SimSettings) -> LensOutputAperture:
-    """Return the iris as whoever owns the rig would describe it: so long it takes from stop to stop, at the most."""
-    way_ms = 1000.0 * chosen.iris_steps / chosen.iris_speed_sps
+    """Return the iris as whoever owns the rig would describe it: so long it takes to its stop, at the most."""
+    way_ms = 1000.0 * INTO_STOP * chosen.iris_steps / chosen.iris_speed_sps
     table = {"output": IRIS, "opening_ms": max(way_ms, IRIS_HOMING_MS) + IRIS_SPARE_MS}
     return aperture_on_lens(table, lens)
 

@@ -1,5 +1,7 @@
 """A Kurokesu SCF4 (three stepper drivers behind a USB serial port) with its motor A in front of a simulated lens.
 
+Its motor C may turn an iris.
+
 What matters to whoever drives one: every command has exactly one reply; ``!1`` tells positions, photo-interrupters and
 whether motors move; the position is a counter of 16 bits that wraps; a move is answered when it was read, not when it
 is over, and there is no other motion than to a number of steps; a delay (``G4``) blocks the parser, so that not even a
@@ -20,9 +22,11 @@ from typing import TYPE_CHECKING
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from elpd_drivers.sim.boards.agenda import Agenda
 from elpd_drivers.sim.boards.axis import Axis
+from elpd_drivers.sim.boards.iris_motor import IrisMotor
 from elpd_drivers.sim.boards.served import ServedBoard
 
 if TYPE_CHECKING:
+    from elpd_drivers.sim.aperture import StepperIris
     from elpd_drivers.sim.lens import SimulatedLens
 
 LINE_LENGTH = 80
@@ -91,10 +95,22 @@ class Scf4Board:
         self._output: list[tuple[int, bytes]] = []
         self._parser_free_ns = begin_ns
         self._code = 600
+        self.iris_motor: IrisMotor | None = None
+        """Motor C, if it turns an iris."""
+        self._iris_code = 600
         self._power_up(begin_ns)
         if self.config.referenced:
             self._axis.set_count(begin_ns, HOMED_COUNT + round(lens.rotor_at(begin_ns)))
             self._ready = True
+
+    # --- the iris --------------------------------------------------------------------------------------------------
+
+    iris_axis = "C"
+    """Which of its motors that is."""
+
+    def add_iris(self, iris: StepperIris) -> None:
+        """Put an iris on motor C."""
+        self.iris_motor = IrisMotor(iris)
 
     # --- the wire's side -------------------------------------------------------------------------------------------
 
@@ -163,6 +179,7 @@ class Scf4Board:
         match word:
             case "G0":
                 self._go(values.get("A"), at_ns)
+                self._turn(values.get("C"), at_ns)
             case "G4" if "P" in values:
                 pass
             case "G90" | "G91":
@@ -170,6 +187,8 @@ class Scf4Board:
             case "G92":
                 if "A" in values:
                     self._axis.set_count(at_ns, values["A"] % WRAP)
+                if "C" in values and self.iris_motor is not None:
+                    self.iris_motor.set_count(at_ns, values["C"] % WRAP)
             case "M0":
                 self._stop(rest, at_ns)
             case "M230" | "M231":
@@ -178,6 +197,7 @@ class Scf4Board:
                 self._led = word == "M238"
             case "M240":
                 self._code = max(values.get("A", self._code), 1)
+                self._iris_code = max(values.get("C", self._iris_code), 1)
             case _ if word[:1] == "M" and word[1:].isdigit() and int(word[1:]) in _SETTINGS:
                 pass
             case _:
@@ -187,7 +207,9 @@ class Scf4Board:
     def _status(self, at_ns: int) -> str:
         count = self._axis.count_at(at_ns) % WRAP
         moving = self._axis.velocity_at(at_ns) != 0.0
-        return f"{count}, 0, 0, {int(self._covered(at_ns))}, 0, 0, {int(moving)}, 0, 0"
+        third = self.iris_motor
+        turned, turning = (0, False) if third is None else (third.count_at(at_ns) % WRAP, third.moving_at(at_ns))
+        return f"{count}, 0, {turned}, {int(self._covered(at_ns))}, 0, 0, {int(moving)}, 0, {int(turning)}"
 
     def _covered(self, at_ns: int) -> bool:
         return self._led and self.lens.rotor_at(at_ns) < self._edge_steps
@@ -207,6 +229,15 @@ class Scf4Board:
             edge_ns = self.lens.reaches(self._edge_steps, at_ns, upwards=covered) if self._led else None
             self._agenda.put("edge", edge_ns, self._halt)
 
+    def _turn(self, number: int | None, at_ns: int) -> None:
+        if number is None or self.iris_motor is None:
+            return
+        if not self._ready or self.iris_motor.moving_at(at_ns):
+            raise RefusedError("BUSY" if self._ready else "NOT INITIALIZED")
+        count = self.iris_motor.count_at(at_ns)
+        goal = count + number if self._relative else number
+        self.iris_motor.move_to(at_ns, goal, self.config.speed_scale / self._iris_code)
+
     def _stop(self, axes: str, at_ns: int) -> None:
         if self.config.ignore_stop or (axes and "A" not in axes):
             return
@@ -224,7 +255,9 @@ class Scf4Board:
         self._agenda.put("edge", None, self._halt)
         self._axis.set_count(at_ns, 0)
         self._relative, self._forced, self._led, self._ready = True, False, False, False
-        self._code = 600
+        self._code = self._iris_code = 600
+        if self.iris_motor is not None:
+            self.iris_motor.set_count(at_ns, 0)
 
 
 BOARD = ServedBoard(Scf4Board, Scf4Config)

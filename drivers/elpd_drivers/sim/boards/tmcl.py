@@ -1,4 +1,4 @@
-"""A Trinamic stepper module that speaks TMCL, in front of a simulated lens.
+"""A Trinamic stepper module that speaks TMCL, its motor 0 in front of a simulated lens; motor 1 may turn an iris.
 
 Nine bytes in, nine bytes out, as the TMCL reference has them: motion commands, axis and global parameters, the
 reference search, the ports, and the module's version. The oddities that matter to a driver:
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from elpd_drivers.sim.boards.agenda import Agenda
 from elpd_drivers.sim.boards.axis import Axis, Happened, Search
+from elpd_drivers.sim.boards.iris_motor import IrisMotor
 from elpd_drivers.sim.boards.served import ServedBoard
 from elpd_drivers.sim.boards.tmcl_words import (
     AXIS_DEFAULTS,
@@ -35,6 +36,7 @@ from elpd_drivers.sim.boards.tmcl_words import (
 )
 
 if TYPE_CHECKING:
+    from elpd_drivers.sim.aperture import StepperIris
     from elpd_drivers.sim.lens import SimulatedLens
 
 FORGET_NS = 5 * NS_PER_MS
@@ -99,7 +101,45 @@ class TmclBoard:
         self._velocity_mode = False
         self._target = 0
         self._driver_flags = 0
+        self.iris_motor: IrisMotor | None = None
+        """Motor 1, if it turns an iris."""
+        self.iris_flags = 0
+        """What its driver says is wrong."""
+        self._iris_speed = AXIS_DEFAULTS[4]
         self._power_up(begin_ns, referenced=self.config.referenced)
+
+    # --- the iris --------------------------------------------------------------------------------------------------
+
+    iris_axis = 1
+    """Which of its motors that is."""
+
+    def add_iris(self, iris: StepperIris) -> None:
+        """Put an iris on motor 1."""
+        self.iris_motor = IrisMotor(iris)
+
+    def _obey_iris(self, motor: IrisMotor, asked: Datagram, at_ns: int) -> int | Status:
+        match asked.command, asked.kind:
+            case 3, _:
+                motor.halt(at_ns)
+            case 4, 0 | 1:
+                target = asked.value if asked.kind == 0 else motor.count_at(at_ns) + asked.value
+                if not self.iris_flags:
+                    motor.move_to(at_ns, target, max(self._iris_speed, 1) * self._units.speed_sps)
+            case 5, 1:
+                motor.set_count(at_ns, asked.value)
+            case 5, 4:
+                if not 0 <= asked.value <= self._units.largest:
+                    return Status.INVALID_VALUE
+                self._iris_speed = asked.value
+            case 6, 1:
+                return motor.count_at(at_ns)
+            case 6, 153 | 154 if self._units.internal:
+                return self._parameters[asked.kind]
+            case 6, 208:
+                return self.iris_flags
+            case _:
+                return Status.WRONG_TYPE
+        return asked.value
 
     # --- the wire's side -------------------------------------------------------------------------------------------
 
@@ -179,7 +219,10 @@ class TmclBoard:
         if handler is None:
             self._reply(asked.command, Status.INVALID_COMMAND, asked.value, at_ns)
             return
-        answer = handler(asked, at_ns)
+        if self.iris_motor is not None and asked.bank == self.iris_axis and asked.command in range(1, 7):
+            answer = self._obey_iris(self.iris_motor, asked, at_ns)
+        else:
+            answer = handler(asked, at_ns)
         if isinstance(answer, Status):
             self._reply(asked.command, answer, asked.value, at_ns)
         else:
@@ -284,6 +327,9 @@ class TmclBoard:
             self._parameters |= {153: self.config.ramp_divisor, 154: self.config.pulse_divisor, 4: 1000, 5: 500}
         self._globals = {(2, MARK_VARIABLE): REFERENCED_MARK} if referenced else {}
         self._velocity_mode, self._driver_flags = True, 0
+        self._iris_speed = AXIS_DEFAULTS[4]
+        if self.iris_motor is not None:
+            self.iris_motor.set_count(at_ns, 0)
         self._target = self._axis.count_at(at_ns)
         self._free_ns = at_ns
         self._watch_switches()

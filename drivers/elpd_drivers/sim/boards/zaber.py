@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 SPEED_UNIT, ACCELERATION_UNIT = 1.6384, 1.6384e-4
 LINE_LENGTH = 80
-IRIS_AXIS = 2
 HOMING_S = 0.5
 """How long an iris takes for its whole way while it is homed."""
 SEVERITY = ("FM", "FO", "WL", "WR", "WH", "NI")
@@ -106,6 +105,9 @@ class ZaberBoard:
             elif len(self._partial) < 2 * LINE_LENGTH:
                 self._partial.append(byte)
 
+    iris_axis = 2
+    """Which of its axes turns it."""
+
     def add_iris(self, iris: StepperIris) -> None:
         """Put an iris on axis 2."""
         self.iris = iris
@@ -155,7 +157,7 @@ class ZaberBoard:
         if device not in {0, self.config.device}:
             return
         try:
-            if axis == IRIS_AXIS and self.iris is not None:
+            if axis == self.iris_axis and self.iris is not None:
                 data, verdict = self._obey_iris(self.iris, words, at_ns), "OK"
             elif axis not in {0, 1}:
                 raise RefusedError("BADAXIS")
@@ -164,7 +166,7 @@ class ZaberBoard:
         except RefusedError as refused:
             data, verdict = str(refused), "RJ"
         numbered = "" if number is None else f" {number:02d}"
-        status = self._iris_status(at_ns) if axis == IRIS_AXIS and self.iris is not None else self._status(at_ns)
+        status = self._iris_status(at_ns) if axis == self.iris_axis and self.iris is not None else self._status(at_ns)
         self._say(f"@{self.config.device:02d} {axis}{numbered} {verdict} {status} {data}", at_ns)
 
     def _say(self, message: str, at_ns: int) -> None:

@@ -1,0 +1,93 @@
+"""One command in force: how it was laid out, what its reports have taught, and what can be asked of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from elpd.motion.kinematics import Knot, state_at
+from elpd.motion.lessons import Lessons, Sensitivity
+from elpd.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from elpd.motion.commanded import Motion
+    from elpd.records import LensReport
+
+FURTHER_STEPS = 1.0
+LOOK_STEP_NS = 1_000_000
+
+
+@dataclass(slots=True)
+class Epoch:
+    """One command in force: its three layouts, what was learnt about it, and the reports that taught it.
+
+    ``anchor`` is the state that it goes on from where that is not its predecessor's: steps, steps/s. ``nominal_ns``
+    is when the command was expected to take effect and ``start_ns`` the value that the layouts are made around;
+    ``delay`` is counted from there.
+    """
+
+    nominal_ns: int
+    start_ns: int
+    motion: Motion
+    delay_sigma_s: float
+    number: int = 0
+    anchor: tuple[float, float] | None = None
+    marked: bool = False
+    steps: float = 0.0
+    variance: float = 0.0
+    path: list[Knot] = field(default_factory=list)
+    later: list[Knot] = field(default_factory=list)
+    further: list[Knot] = field(default_factory=list)
+    later_s: float = 0.0
+    lessons: Lessons = field(default_factory=Lessons)
+    reports: list[LensReport] = field(default_factory=list)
+
+    def forget_lessons(self, pace_sigma: float) -> None:
+        """Go back to what was supposed before any report."""
+        delay = (self.nominal_ns - self.start_ns) / NS_PER_S
+        self.lessons = Lessons.supposed(self.variance, delay, self.delay_sigma_s, pace_sigma)
+
+    def depends(self, when_ns: int) -> tuple[float, float, Sensitivity]:
+        """Return position, velocity, and how the position depends on what is learnt."""
+        steps, velocity = state_at(self.path, when_ns)
+        h = Sensitivity(
+            (state_at(self.further, when_ns)[0] - steps) / FURTHER_STEPS,
+            (state_at(self.later, when_ns)[0] - steps) / self.later_s if self.later_s else 0.0,
+            velocity * max(when_ns - self.start_ns, 0) / NS_PER_S,
+        )
+        return steps + self.lessons.shift(h), velocity, h
+
+    def passed(self, steps: float, until_ns: int, while_ns: int) -> float | None:
+        """Return the velocity at which it passed *steps* in the *while_ns* before *until_ns*; None: it did not."""
+        when = until_ns
+        after, velocity = state_at(self.path, when)
+        while when > max(self.start_ns, until_ns - while_ns):
+            when -= LOOK_STEP_NS
+            before, velocity = state_at(self.path, max(when, self.start_ns))
+            if min(before, after) <= steps <= max(before, after):
+                return velocity
+            after = before
+        return None
+
+    def hears_nothing_new(self, report: LensReport, when_ns: int) -> bool:
+        """Say whether it has heard that before: at rest the same number again is the same rounding error again."""
+        if not self.reports:
+            return False
+        last = self.reports[-1]
+        vaguer = last.latest_ns - last.earliest_ns > 2 * (report.latest_ns - report.earliest_ns)
+        again = report.steps == last.steps and not report.moving and not last.moving and not vaguer
+        return again and state_at(self.path, when_ns)[1] == 0.0
+
+    def strays_if_begun_early(self, when_ns: int, velocity_sps: float) -> float:
+        """Return by how many steps (one sigma) it may have changed the motion already, at *when_ns* before its start.
+
+        Until it begins the motor runs at *velocity_sps*. Taken from a beginning two standard deviations early.
+        """
+        early_s = 2.0 * math.sqrt(max(self.lessons.c_dd, 0.0))
+        since_s = (when_ns - self.start_ns) / NS_PER_S + early_s
+        if since_s <= 0.0:
+            return 0.0
+        began, _ = state_at(self.path, self.start_ns)
+        now, _ = state_at(self.path, self.start_ns + round(since_s * NS_PER_S))
+        return (now - began - velocity_sps * since_s) / 2.0
