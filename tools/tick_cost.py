@@ -7,13 +7,14 @@ per event is that of keeping it and of adding it to the image. CPU time of this 
 from __future__ import annotations
 
 import time
+from itertools import count
 from statistics import median
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elpd.records import Geometry, Roi
-from elpd.vision.bearing import Gauge
+from elpd.vision.bearing import Bearing, Unrest
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.memory import EventMemory
 
@@ -39,8 +40,9 @@ def main() -> None:
         memory.add(t_us, x, y, on)
         memory.advance(EVENTS, 0.0)
         per_tick = spent_us(lambda m=memory: m.advance(EVENTS, 1.0))  # type: ignore[misc]
-        gauge, image = Gauge(ROI_MARGIN_PX), memory.image
-        look = spent_us(lambda g=gauge, i=image: g.look(i, 0))  # type: ignore[misc]
+        image, ticks = memory.image.copy(), count(step=750)
+        bearing = Bearing(Unrest(0.0, 1e9), ROI_MARGIN_PX, image)  # never certain, so that every look is whole
+        look = spent_us(lambda b=bearing, i=image, t=ticks: b.look(i, next(t)))  # type: ignore[misc]
         print(f"{side:>8d}x{side:<3d}{1000 * per_event:>14.1f}{per_tick:>13.0f}{look:>24.0f}")
 
 

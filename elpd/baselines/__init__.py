@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from elpd.baselines import balance, contrast, egs, elp_published, esva, event_rate, pbf, search
+from elpd.baselines import balance, contrast, egs, elp_published, esva, event_rate, pbf, registered, search
 from elpd.baselines.stack import Estimate, FocusStack, LensPath, Peer, StackFrame
 
 __all__ = ["PEERS", "Entry", "Estimate", "FocusStack", "LensPath", "Peer", "StackFrame"]
@@ -41,6 +41,7 @@ PEERS: dict[str, Entry] = {
     ),
     "hill-climb": Entry("hill climbing", search.estimate_hill_climb, _MOVES, needs_frames=True),
     "fibonacci": Entry("Fibonacci search", search.estimate_fibonacci, _MOVES, needs_frames=True),
+    "registered": Entry("registered regression", registered.estimate, "the past only", needs_frames=True),
     "elp-syn": Entry(
         "ELP as published (SYN)", elp_published.published(elp_published.SYN), _HINDSIGHT, needs_frames=True
     ),

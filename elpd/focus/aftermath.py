@@ -71,7 +71,6 @@ class Aftermath:
         self._settings = settings
         self._locate = locate
         self._course = sweep
-        self._outward = sweep  # the last in the sweep's direction
         self._turned_us = FOR_EVER
         self._passes = Passes()
         self._unheard: list[CameraPacket] = []
@@ -131,7 +130,7 @@ class Aftermath:
             self._unheard.append(replace(packet, data=packet.data.copy(), frames=()))
         for sample in hearing.windows(packet):
             if sample.end_us <= self._turned_us:
-                self._outward.samples.append(sample)
+                self._course.samples.append(sample)
             self.events_back += sample.n_on + sample.n_off if sample.begin_us >= self.back_from_us else 0
 
     def go_back(self, at_us: SensorUs) -> None:
@@ -139,9 +138,9 @@ class Aftermath:
         self.back_from_us, self.events_back = at_us, 0
 
     def events_within(self, from_um: float, to_um: float) -> int:
-        """Return how many events the last pass in the sweep's direction saw between two places."""
+        """Return how many events the last pass saw between two places."""
         low, high = min(from_um, to_um), max(from_um, to_um)
-        return sum(one.n_on + one.n_off for one in self._outward.samples if low <= one.position_um <= high)
+        return sum(one.n_on + one.n_off for one in self._course.samples if low <= one.position_um <= high)
 
     def return_score(self, focus_um: float) -> float | None:
         """Return by how many standard deviations the way back undid what the way out from focus had done to the pixels.
@@ -154,16 +153,21 @@ class Aftermath:
     def sharpened_again(self) -> float | None:
         """Return how much sharper the image became on the way back, as a share of what it had lost since its peak.
 
-        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once,
-        with the lens at rest.
+        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once
+        after each way, with the lens at rest.
         """
         track = self._hearing.memory.track
         if not self.scene_moves or self._hearing.lamp is not None or not track.drop > 0.0:
             return None
         lost, far = track.drop, track.values[-1]
-        self.catch_up()
-        self._hearing.memory.advance(self._hearing.last_us, track.positions[-1])
+        self.look()
         return (track.values[-1] - far) / lost
+
+    def look(self) -> None:
+        """Measure how sharp the image is that all events have built."""
+        self.catch_up()
+        memory = self._hearing.memory
+        memory.advance(self._hearing.last_us, memory.track.positions[-1])
 
     # --- where focus was ---
 
@@ -196,9 +200,14 @@ class Aftermath:
         self._passes.add(said, course.leg.sign, (course.decided_us - look_back_us, course.decided_us))
         return self._passes.estimate(settings.play)
 
+    @property
+    def lag_um(self) -> tuple[float, float]:
+        """How well the first pass knows its lag, and focus but for what makes events late, um."""
+        return self._passes.lag_um()
+
     def take_for_moving(self) -> None:
-        """Take the scene for one that moves: what has been said of it as still is forgotten."""
-        self._passes.forget()
+        """Take the scene for one that moves: of what has been said of it as still only what holds then is believed."""
+        self._passes.take_for_moving()
 
     @property
     def gap_near_crossing(self) -> bool:
@@ -213,16 +222,17 @@ class Aftermath:
             self._hearing.keep(packet)
         self._unheard = []
 
-    def begin_again(self, sign: int, at_us: SensorUs, from_um: float) -> None:
-        """Begin to pass focus once more, in either direction.
+    def begin_again(self, sign: int, from_um: float) -> None:
+        """Begin to pass focus once more, in either direction, with what has not been heard yet.
 
         The image is gone on with; its sharpness is followed from *from_um* on, where the play has been taken up.
         """
+        self.catch_up()
+        at_us = self._hearing.last_us
         self._hearing.begin_again(at_us)
         leg = replace(self._course.leg, sign=sign, begun_us=at_us, judge_from_um=sign * from_um)
         frames = FrameTrack(self._hearing.roi, follow=self.scene_moves)
         self._course = Course(leg, self._hearing.memory, frames, self._course.heading)
-        self._outward = self._course if sign == self._passes.sign else self._outward
         self._turned_us = FOR_EVER
 
     def pass_again(self, packet: CameraPacket) -> None:
@@ -232,6 +242,11 @@ class Aftermath:
             self._course.follow(sample)
         for frame in packet.frames:
             self._course.see(frame, self._locate)
+
+    @property
+    def seen_again(self) -> bool:
+        """Whether the further pass has seen the image become sharp, and duller again."""
+        return self._course.passed
 
     def passed_again(self) -> None:
         """End the further pass: from here on packets are of the way back. ``estimate`` may be asked again."""

@@ -106,6 +106,11 @@ class WayBack:
             self._move(turn_um)
         return self._move(focus_um)
 
+    def go_off(self, focus_um: float, distance_um: float) -> None:
+        """Go off *focus_um*, to the side that the sweep came from, and rest there."""
+        self._aim_um = None
+        self._move(focus_um - self._sign * (self._backlash_um + distance_um))
+
     def _turn_um(self, focus_um: float) -> float:
         return self._stage.within_limits_um(focus_um - self._sign * (self._backlash_um + APPROACH_MARGIN_UM))
 
@@ -149,9 +154,11 @@ def come_to_rest(stage: Stage, watch: Watch, stop: CommandStamp, way: WayBack, s
     return standstill(stage, watch, stop, sign)
 
 
-def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport, focus_um: float) -> int:
+def verify(stage: Stage, watch: Watch, settings: CycleSettings, way: WayBack, rest: LensReport, focus_um: float) -> int:
     """See that the lens is where it was sent, and that the scene changed on the way: reports alone prove nothing.
 
+    Where the scene moves, motion may hide what the lens did, so that the way is made a second time before anybody
+    says that it did nothing.
     Returns the events above noise that the way back made. Raises ``Ended`` if either is not so.
     """
     error_um = stage.to_um(rest.steps) - focus_um
@@ -171,6 +178,13 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, rest: LensReport
         return seen
     sharpened = watch.after.sharpened_again()
     if sharpened is not None:
+        if way_back_um > settings.depth_of_focus_um and sharpened < RETURN_SHARE:
+            way.go_off(focus_um, way_back_um)
+            stage.hear(safety.CAMERA_SILENCE_MS)
+            watch.after.look()
+            way.arrive(focus_um)
+            stage.hear(safety.CAMERA_SILENCE_MS)
+            sharpened = watch.after.sharpened_again() or 0.0
         if way_back_um > settings.depth_of_focus_um and sharpened < RETURN_SHARE:
             raise Ended(
                 Outcome.LENS_DID_NOT_MOVE,

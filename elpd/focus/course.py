@@ -93,17 +93,25 @@ class Course:
             return
         if 2 * sample.shed_us < duration_us:  # a window that was hardly looked at says nothing
             self.heading.feed(sample, self._memory, ticked=ticked)
-        far = self._memory.track.drop > FAR_DROP
-        if self.heading.seen_ahead and not self.passed and far and self._memory.peak_passed:
+        if self.heading.seen_ahead and not self.passed and self._seen_to_pass:
             self.passed = True
             self.decided_us = SensorUs(max(sample.end_us, last_us))
 
     def follow(self, sample: ElpSample) -> None:
-        """Follow the image's sharpness in a window of a further pass, and judge nothing."""
+        """Follow the image's sharpness in a window of a further pass, whose direction nobody asks.
+
+        It has passed focus by the same test of rise and fall as a sweep.
+        """
         self.samples.append(sample)
         end_um = sample.position_um + 0.5 * sample.travel_um
         if sample.begin_us >= self.leg.begun_us and self.leg.sign * end_um >= self.leg.judge_from_um:
             self._tick(sample, end_um)
+            self.passed = self.passed or self._seen_to_pass
+
+    @property
+    def _seen_to_pass(self) -> bool:
+        """Whether the image has become as sharp as it gets, and by far duller again."""
+        return self._memory.track.drop > FAR_DROP and self._memory.peak_passed
 
     def see(self, frame: Frame, locate: Callable[[SensorUs], float]) -> None:
         """Take a frame, if it was exposed since this direction of travel began."""

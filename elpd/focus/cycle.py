@@ -193,7 +193,7 @@ class FocusCycle:
         self._phase(Phase.RETURN)
         rest = way.arrive(estimate.focus_um)
         self._phase(Phase.VERIFY)
-        self._details["return_events"] = verify(self._stage, watch, self._settings, rest, estimate.focus_um)
+        self._details["return_events"] = verify(self._stage, watch, self._settings, way, rest, estimate.focus_um)
         return Outcome.FOCUSED, self._sentence(estimate)
 
     def _arm(self, reference: Reference, roi: Roi, picture: Picture) -> Watch:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elpd.units import SensorUs
 from elpd.vision.crossing import frame_witness, fuse, lamp_witness
+from elpd.vision.drift import find_drift
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
 
@@ -55,6 +56,10 @@ class Testimony:
     """How long pixels are deaf after an event, by its events."""
     scene_moves: bool = False
     """Whether the scene moved while it was passed over."""
+    if_it_moves: tuple[Witness, ...] = ()
+    """What is left of a scene that was taken for still, should it turn out to move."""
+    picture: NDArray[np.float32] | None = None
+    """Such a scene at its sharpest, (height, width) in thresholds: where it lay in this pass."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +99,16 @@ class Pass:
         if said is None:
             return Testimony(tuple(self.ask_frames(locate)), deaf=deaf)
         undated_um = 1e-6 * self.speed_um_s * deaf.sigma_us
+        in_motion = replace(self, scene_moves=True)
+        moved = (*in_motion.ask_frames(locate), *self._in_motion(said, undated_um))
         if self.scene_moves or (not said.depths and said.drift.seen):
-            witnesses = [*self.ask_frames(locate), *self._in_motion(said, undated_um)]
-            return Testimony(tuple(witnesses), (), memory.flicker(), deaf, scene_moves=True)
+            return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True)
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, undated_um)))
             for one in said.witnesses(unexplained, self.width_um)
         ]
         frames = [] if said.depths else self.ask_frames(locate)  # of several planes frames show a mixture
-        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf)
+        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
 
     def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
         """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
@@ -114,10 +120,8 @@ class Pass:
         strayed_um = tilt * said.image.finest.width**2 / self.width_um
         return [
             replace(
-                one,
-                at=one.at + said.lag.at - lag.at,
+                one.with_lag(lag.at, float(np.hypot(lag.sigma, undated_um))),
                 sigma=float(np.hypot(one.sigma, strayed_um)),
-                shared=float(np.hypot(lag.sigma, undated_um)),
             )
             for one in said.witnesses(width=self.width_um)
             if one.name == "vertex"
@@ -179,12 +183,20 @@ class Passes:
         self._near_us.append(near_us)
         self.depths_um = tuple(sign * at for at in said.depths) or self.depths_um
         self.flicker = said.flicker or self.flicker
-        self.scene_moves |= said.scene_moves
+        if said.scene_moves or self._moved_between():
+            self.take_for_moving()
         self.deaf = self.deaf or said.deaf
 
-    def forget(self) -> None:
-        """Forget what witnesses said of a scene that was taken for still; it moves."""
-        self._said = [(Testimony(), sign) for _, sign in self._said]
+    def _moved_between(self) -> bool:
+        """Say whether the newest pass met the scene elsewhere than an earlier one did."""
+        *earlier, newest = (said.picture for said, _ in self._said)
+        return newest is not None and any(
+            find_drift(np.stack([one, newest])).seen_between for one in earlier if one is not None
+        )
+
+    def take_for_moving(self) -> None:
+        """Believe of what was said of a scene that was taken for still only what holds where it moves."""
+        self._said = [(said if said.scene_moves else Testimony(said.if_it_moves), sign) for said, sign in self._said]
         self.scene_moves = True
 
     @property
@@ -196,15 +208,36 @@ class Passes:
         """Say whether any of the times was near focus."""
         return any(begin <= when <= end for begin, end in self._near_us for when in times_us)
 
+    def lag_um(self) -> tuple[float, float]:
+        """Return how well the first pass knows its lag, and focus but for what makes events late: standard errors, um.
+
+        The worst and the best of its witnesses. Without any: nothing, infinity.
+        """
+        said = self._said[0][0].witnesses if self._said else ()
+        late = [one for one in said if one.shared > 0.0]
+        return max((one.shared for one in late), default=0.0), min((one.sigma for one in late), default=inf)
+
+    def _of_one_lag(self) -> list[tuple[Witness, int]]:
+        """Return all witnesses, each with the direction of its pass.
+
+        Where there is more than one pass, those of one kind have the same lag taken off, their mean: what is common to
+        passes there and back cancels, and what each measured of the lag by itself would not.
+        """
+        said = [(one, sign) for testimony, sign in self._said for one in testimony.witnesses]
+        if len(self._said) < 2:
+            return said
+        evened = []
+        for one, sign in said:
+            alike = [other for other, _ in said if other.name == one.name]
+            freed, shared = (float(np.mean([getattr(other, key) for other in alike])) for key in ("freed", "shared"))
+            evened.append((one.with_lag(freed, shared), sign))
+        return evened
+
     def estimate(self, play: Play) -> FocusEstimate | None:
         """Return where focus is, on the motor's ruler, while the carriage is pushed in the sweep's direction."""
         sweep = self.sign
         found = fuse(
-            [
-                one if sign == sweep else one.on_the_way_back(play.um, play.sigma_um)
-                for said, sign in self._said
-                for one in said.witnesses
-            ]
+            [one if sign == sweep else one.on_the_way_back(play.um, play.sigma_um) for one, sign in self._of_one_lag()]
         )
         if found is None:
             return None

@@ -1,10 +1,13 @@
-"""More passes over focus, there and back, where the scene moves and one is not to be believed.
+"""More passes over focus, there and back, where one is not to be believed: the scene moves, or the light is dim.
 
 Whatever answers late (photoreceptors, pixels that hold back less than a threshold, motion that dithers them) is late by
 as much on the way back as on the way there, at the same speed: the mean of the two knows focus, and what is left is the
 play between motor and carriage and what the motion did by chance. The chance is another one in each pass, so passes are
 made until the answer is good enough or there have been enough of them. They are as fast as the sweep, because a scene
 strays with time: a slow pass sees more of its motion.
+
+In a still scene it is dim light that asks for another pass. Photoreceptors are late there by more than an answer may be
+off, and what one pass tells of that hangs on which pixels are how dark. One way back does, at the sweep's speed.
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ from typing import TYPE_CHECKING
 
 from elpd.focus import judging, safety
 from elpd.focus.approach import APPROACH_MARGIN_UM
+from elpd.records import StopMode
+from elpd.units import after_ms
 
 if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings
@@ -22,33 +27,51 @@ if TYPE_CHECKING:
     from elpd.units import HostNs
 
 REACH_DOF = 6.0
-"""How far to both sides of focus a pass leads at full speed: a width of the curve, and the way by which pixels answer
-late."""
+"""How far to both sides of focus a pass leads at full speed at the most: a width of the curve, and the way by which
+pixels answer late."""
+
+RUN_UP_DOF = 3.5
+"""How far from focus a pass is at full speed at the latest: that much of the curve beside its top is believed."""
 
 MOST_DOUBT_DOF = 1.0
 """An answer that is off by more than this beside the reach has no second opinion."""
 
-MOST_ROUNDS = 3
-"""Rounds, there and back, at the most: six passes halve the error of one and a half, and take a quarter of a second."""
+CERTAIN_SIGMAS = 3.0
+"""So many standard errors are to lie within a depth of focus; until they do there are further rounds."""
+
+MOST_ROUNDS = 4
+"""Further rounds, there and back, at the most: seven to nine passes halve the error of two."""
+
+LOOKS_FOR_MOTION = 1
+"""Rounds that are spent on seeing whether a scene moves that was taken for still: hands tremble at 5 Hz and faster, and
+two passes and a round last long enough for one to be seen on its way."""
+
+SIGMAS = 3.0
+"""So many standard errors may a lag lie from what was taken off for it; a depth of focus has to hold them."""
 
 ROUNDS_LEFT = 2.0
 """How many more rounds there must be time for, so that one is begun: the way to focus takes less than one."""
 
 
 def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
-    """Say whether one pass is not enough: the scene has been seen to move.
+    """Say whether one pass is not enough: the scene has been seen to move, the light is dim, or the answer is doubtful.
 
-    In a still scene a doubtful answer may come of several depths as well as of the lag; more passes would only make
-    their mixture look certain, so such an answer is refused as it is. Where motion was suspected at rest, the scene is
-    taken for one that moves after all, and what the first pass said of it as still is forgotten. Where events were
-    lost near focus, or a lamp flickers, other passes would not help.
+    Where motion was suspected at rest and the answer is doubtful, the scene is taken for one that moves after all.
+    Where events were lost near focus, a lamp flickers or several depths were told, other passes would not help.
     """
     if watch.after.gap_near_crossing or watch.lit:
         return False
-    doubtful = first is None or first.sigma_um > judging.limit_um(settings)
-    if not watch.scene_moves and doubtful and watch.motion_suspected and not watch.after.depths_um:
+    doubtful = (first is None or first.sigma_um > judging.limit_um(settings)) and not watch.after.depths_um
+    if not watch.scene_moves and doubtful and watch.motion_suspected:
         watch.after.take_for_moving()
-    return watch.scene_moves
+    return watch.scene_moves or doubtful or _is_dim(watch, settings)
+
+
+def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
+    """Say whether the lag alone may put a still scene's answer out of focus, and nothing else is in the way of one."""
+    lag_um, but_for_it_um = watch.after.lag_um
+    clear = but_for_it_um <= judging.limit_um(settings) and not watch.after.depths_um
+    return clear and SIGMAS * lag_um > settings.depth_of_focus_um
 
 
 def pass_again(
@@ -59,50 +82,65 @@ def pass_again(
     sign: int,
     deadline_ns: HostNs,
 ) -> tuple[FocusEstimate | None, float]:
-    """Go over focus again, there and back, until it is known or there is no more time.
+    """Go over focus again until it is known or there is no more time: back, and then there and back.
 
-    Returns what all passes say and the furthest place, um, in the sweep's direction.
+    Returns what all passes say and the furthest place, um, in the sweep's direction. In a still scene a doubtful answer
+    may come of several depths; more passes would only make their mixture look certain. So they are believed only if it
+    is the lag alone that is in doubt, or if one of them has seen the scene move, which a hand that turned round in the
+    first did not show; else the answer is refused as it is.
 
     The way is bounded: a few times the reach, the ramps and the play; its time is the caller's phase ``recross``. The
     lens is left on the side that the sweep came from.
     """
-    estimate, most_um = first, judging.limit_um(settings)
+    estimate, dim = first, _is_dim(watch, settings)
+    certain_um = min(settings.depth_of_focus_um / CERTAIN_SIGMAS, judging.limit_um(settings))
     furthest_um = stage.here_um()
-    for _ in range(MOST_ROUNDS):
+    for looks, ways in enumerate([(-sign,), *MOST_ROUNDS * [(sign, -sign)]]):
         begun_ns = stage.now_ns()
         about_um = watch.after.peak_um if estimate is None else estimate.focus_um
         doubt_um = MOST_DOUBT_DOF * settings.depth_of_focus_um
         if estimate is not None:
             doubt_um = min(doubt_um, estimate.sigma_um)
-        for way in (sign, -sign):
-            rest_um = _pass(stage, watch, settings, about_um, doubt_um, way)
-            furthest_um = sign * max(sign * furthest_um, sign * rest_um)
+        for way in ways:
+            _pass(stage, watch, settings, about_um, doubt_um, way)
+            furthest_um = sign * max(sign * furthest_um, sign * stage.here_um())
             estimate = watch.after.estimate()
         took_ns = stage.now_ns() - begun_ns
-        if estimate is not None and estimate.sigma_um <= most_um:
-            break
-        if stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
+        if watch.scene_moves or dim:
+            enough = estimate is not None and estimate.sigma_um <= certain_um
+        else:
+            estimate, enough = first, looks == LOOKS_FOR_MOTION
+        if enough or stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
             break
     return estimate, furthest_um
 
 
-def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, doubt_um: float, way: int) -> float:
-    """Lead the lens over *about_um* in one direction; return where it rests, um."""
-    limits = stage.parts.lens.limits
+def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, doubt_um: float, way: int) -> None:
+    """Lead the lens over *about_um* in one direction, until focus has been seen to be passed."""
+    limits, capabilities = stage.parts.lens.limits, stage.parts.lens.capabilities
     speed_um_s = min(settings.speed_um_s, stage.to_um(limits.max_speed_sps))
-    reach_um = REACH_DOF * settings.depth_of_focus_um + doubt_um
     ramp_um = speed_um_s**2 / (2.0 * stage.to_um(limits.acceleration_sps2))
-    away_um = reach_um + ramp_um + settings.backlash_um + APPROACH_MARGIN_UM
-    begin_um, end_um = (stage.within_limits_um(about_um + side * way * away_um) for side in (-1, 1))
-    watch.after.catch_up()
-    stage.listener = watch.follow
-    if abs(stage.here_um() - begin_um) > stage.um_per_step:
+    beside_um = ramp_um + settings.backlash_um + APPROACH_MARGIN_UM
+    reach_um, run_up_um = (dof * settings.depth_of_focus_um + doubt_um for dof in (REACH_DOF, RUN_UP_DOF))
+    begin_um = stage.within_limits_um(about_um - way * (run_up_um))
+    end_um = stage.within_limits_um(about_um + way * (reach_um + beside_um))
+    if way * (stage.here_um() - begin_um) > stage.um_per_step:
+        watch.after.catch_up()
+        stage.listener = watch.follow
         stage.move(begin_um, stage.to_um(limits.max_speed_sps))
-    stage.hear(safety.CAMERA_SILENCE_MS)
-    watch.after.begin_again(way, stage.sensor_clock.to_sensor(stage.now_ns()), about_um - way * reach_um)
+    taken_up_um = way * stage.here_um() + settings.backlash_um
+    watch.after.begin_again(way, way * max(taken_up_um, way * about_um - reach_um))
     stage.listener = watch.after.pass_again
-    rest = stage.move(end_um, speed_um_s)
-    stage.hear(safety.CAMERA_SILENCE_MS)
+    if capabilities.native_velocity and capabilities.abrupt_stop:
+        stage.send(end_um, speed_um_s)
+        until = after_ms(stage.now_ns(), stage.travel_limit_ms(end_um, speed_um_s))
+        while not watch.after.seen_again and stage.now_ns() < until:
+            stage.read()
+            if way * (stage.here_um() - end_um) > -stage.um_per_step:
+                break
+        stage.parts.lens.stop(StopMode.ABRUPT)
+    else:
+        stage.move(end_um, speed_um_s)
+        stage.hear(safety.CAMERA_SILENCE_MS)
     watch.after.passed_again()
     stage.listener = watch.after.hear_out
-    return stage.to_um(rest.steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -77,3 +78,16 @@ class Epoch:
         vaguer = last.latest_ns - last.earliest_ns > 2 * (report.latest_ns - report.earliest_ns)
         again = report.steps == last.steps and not report.moving and not last.moving and not vaguer
         return again and state_at(self.path, when_ns)[1] == 0.0
+
+    def strays_if_begun_early(self, when_ns: int, velocity_sps: float) -> float:
+        """Return by how many steps (one sigma) it may have changed the motion already, at *when_ns* before its start.
+
+        Until it begins the motor runs at *velocity_sps*. Taken from a beginning two standard deviations early.
+        """
+        early_s = 2.0 * math.sqrt(max(self.lessons.c_dd, 0.0))
+        since_s = (when_ns - self.start_ns) / NS_PER_S + early_s
+        if since_s <= 0.0:
+            return 0.0
+        began, _ = state_at(self.path, self.start_ns)
+        now, _ = state_at(self.path, self.start_ns + round(since_s * NS_PER_S))
+        return (now - began - velocity_sps * since_s) / 2.0

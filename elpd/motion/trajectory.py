@@ -148,10 +148,11 @@ class Trajectory:
     def expect(self, report: LensReport) -> Surprise:
         """Say how far *report* is from the model, without learning from it. Raises ``LensError`` before ``begin``."""
         when, sigma_s = self._sampled(report)
-        epoch = self._epochs[self._index(when)]
+        index = self._index(when)
+        epoch = self._epochs[index]
         steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
-        variance = self._variance(epoch, velocity, h) + reading
+        variance = self._variance(epoch, velocity, h) + self._early_variance(index, when, velocity) + reading
         return Surprise(report.steps - steps, math.sqrt(variance))
 
     def observe(self, report: LensReport) -> None:
@@ -173,7 +174,7 @@ class Trajectory:
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
-        self._correct(epoch, report)
+        self._correct(index, report)
         if self._relay(index):
             self._follow_from(index)
         elif index + 1 < len(self._epochs):
@@ -220,12 +221,13 @@ class Trajectory:
 
         Raises ``LensError`` before the first report and beyond the history.
         """
-        epoch, steps, velocity, h = self._state(when)
-        return PositionEstimate(steps, math.sqrt(self._variance(epoch, velocity, h)))
+        when, index, steps, velocity, h = self._state(when)
+        variance = self._variance(self._epochs[index], velocity, h) + self._early_variance(index, when, velocity)
+        return PositionEstimate(steps, math.sqrt(variance))
 
     def velocity_at(self, when: HostNs) -> float:
         """Return the modelled velocity in steps/s at *when*."""
-        return self._state(when)[2]
+        return self._state(when)[3]
 
     def at_rest_from(self) -> int | None:
         """Return when the motion commanded last ends, in ns, or None if it does not end by itself."""
@@ -246,7 +248,7 @@ class Trajectory:
         surprise = self.expect(report)
         return abs(surprise.steps) > _UNLIKELY * surprise.sigma_steps
 
-    def _state(self, when: int) -> tuple[Epoch, float, float, Sensitivity]:
+    def _state(self, when: HostNs) -> tuple[HostNs, int, float, float, Sensitivity]:
         if not self._epochs:
             raise LensError("lens: position asked for before the controller reported any; poll it first")
         oldest = self._epochs[0]
@@ -256,9 +258,9 @@ class Trajectory:
                     f"lens: position asked for {(oldest.start_ns - when) / 1e6:.1f} ms before the oldest that is "
                     f"remembered (history {self._history_ns / NS_PER_S:.0f} s); ask sooner"
                 )
-            when = oldest.start_ns  # the first report found it at rest
-        epoch = self._epochs[self._index(when)]
-        return (epoch, *epoch.depends(when))
+            when = HostNs(oldest.start_ns)  # the first report found it at rest
+        index = self._index(when)
+        return (when, index, *self._epochs[index].depends(when))
 
     def _index(self, when: int) -> int:
         for index in range(len(self._epochs) - 1, 0, -1):
@@ -312,7 +314,7 @@ class Trajectory:
             epoch.later += lay_out(late, late_steps, motion.pieces(late_steps, late_velocity))
         epoch.forget_lessons(self._timing.pace_sigma)
         for report in epoch.reports:
-            self._correct(epoch, report)
+            self._correct(index, report)
 
     def _relay(self, index: int) -> bool:
         """Move an epoch's start to where its delay says, if that is far; say whether it moved."""
@@ -339,20 +341,36 @@ class Trajectory:
                 self._follow(index - 1)
         return moved
 
-    def _correct(self, epoch: Epoch, report: LensReport) -> None:
+    def _correct(self, index: int, report: LensReport) -> None:
+        epoch = self._epochs[index]
         when, sigma_s = self._sampled(report)
         steps, velocity, h = epoch.depends(when)
         reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
-        noise = reading + self._model_variance(epoch, velocity)
+        noise = reading + self._model_variance(epoch, velocity) + self._early_variance(index, when, velocity)
         epoch.lessons.correct(report.steps - steps, h, noise)
 
     def _variance(self, epoch: Epoch, velocity: float, h: Sensitivity) -> float:
         common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
-        learnt = epoch.lessons.variance(h)
-        if not velocity and epoch.motion.target_steps is None and epoch.number:
-            # stopped on the way, where the count was rounded each time it was told, to the same side at last
-            learnt = max(learnt, self._timing.rest_quantum_steps**2 / 12)
+        learnt = max(epoch.lessons.variance(h), self._rounding_variance(epoch, velocity))
         return learnt + common * common + self._model_variance(epoch, velocity)
+
+    def _rounding_variance(self, epoch: Epoch, velocity: float) -> float:
+        """Return what no number of reports averages away of their rounding.
+
+        Asked at regular intervals, a motor at some speeds is told with the same rounding error each time; and one that
+        was stopped on its way, with the last one for ever. Marks are not rounded, and targets are known.
+        """
+        if velocity:
+            return 0.0 if epoch.marked else self._timing.quantum_steps**2 / 12
+        stopped = epoch.motion.target_steps is None and epoch.number
+        return self._timing.rest_quantum_steps**2 / 12 if stopped else 0.0
+
+    def _early_variance(self, index: int, when: int, velocity: float) -> float:
+        """Return what it adds that the command after epoch *index* may have begun before its time."""
+        if index + 1 == len(self._epochs):
+            return 0.0
+        strays = self._epochs[index + 1].strays_if_begun_early(when, velocity)
+        return strays * strays
 
     def _model_variance(self, epoch: Epoch, velocity: float) -> float:
         strays = self._timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0

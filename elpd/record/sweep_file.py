@@ -127,7 +127,7 @@ class SweepSearch:
         self._meter = Meter(roi, windows, self._begin_us, ruler, cap)
         self._detector = Detector()
         self._frames = PeakTrack()
-        self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX)
+        self._frame_energy = FrameEnergy(roi, ROI_MARGIN_PX, follow=True)
         self._first = int(np.searchsorted(sweep.t_us, self._begin_us, side="left"))
         self._memory = EventMemory(roi, sweep.geometry, sensor=sensor)
         self._attempts = 0

@@ -19,20 +19,22 @@ import numpy as np
 
 from elpd.records import FocusEstimate
 from elpd.vision.bands import BandFocus, average_focus, band_products, focus_of_bands, freed_of_noise
-from elpd.vision.drift import Drift, find_drift
+from elpd.vision.drift import LOOKS, Drift, find_drift
 from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
-from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, weights_of_lines
+from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
 from elpd.vision.light import in_focus, worth_of_an_event
 from elpd.vision.pairs import Mode, Pairs, find_pairs, weighted_mode
 from elpd.vision.planes import FLANK, MIN_PAIRS, find_planes, flank_width
 from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
+from elpd.vision.turns import Slowness, Turns, blocks_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from elpd.vision.lag import LagPrior, Line
+    from elpd.vision.lag import LagPrior
+    from elpd.vision.turns import Line
 
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
@@ -72,6 +74,10 @@ event. An image that does not stand above it at its sharpest shows the sensor, n
 PAIRS_DEPART = 2.0
 """Pairs sit on the finest detail: what they depart from focus, in departures of the finest band."""
 
+PAIRS_REACH = 0.8
+"""How far, in widths of the curve, a pair may lie from the mode to have a say about the lag: dark pixels have lags of
+half a width in a dim room."""
+
 PAIRS_KERNEL = 0.15
 """Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
 
@@ -79,10 +85,12 @@ LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
 
-LAG_UNEXPLAINED_IN_FOCUS = 0.4
-"""The same where the events have told what the picture is in focus. What an event is worth is known to a quarter,
-because light crosses a region's border, and with it the slowness of dark pixels: one lag was underrated by four tenths.
-"""
+WORTH_UNKNOWN = 0.25
+"""Standard deviation, in shares, of what an event is worth by the light that a lens conserves: some crosses a region's
+border, and thresholds differ from pixel to pixel (seven dim scenes: 0.17 to 0.26 for a true 0.2)."""
+
+DARK_UNKNOWN = 0.25
+"""The same of the dark current: it is relative to the brightest parts of a region, which need not be bright."""
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
@@ -146,6 +154,8 @@ class Witness:
     shared: float = 0.0
     held: float = 0.0
     play: float = 0.0
+    freed: float = 0.0
+    """How much lag was taken off ``at``."""
 
     @property
     def total_sigma(self) -> float:
@@ -157,7 +167,13 @@ class Witness:
 
         What was late lies to the other side there, and the carriage is behind the motor by the *play*.
         """
-        return replace(self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma)
+        return replace(
+            self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma, freed=-self.freed
+        )
+
+    def with_lag(self, freed: float, shared: float) -> Witness:
+        """Return the same as if another lag had been taken off, which is known to *shared*."""
+        return replace(self, at=self.at + self.freed - freed, freed=freed, shared=shared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +196,8 @@ class EventWitnesses:
     """How far the scene went across the sensor meanwhile."""
     expected_lag: Lag = field(default_factory=Lag)
     """What the image would have been freed of if no pair had been asked."""
+    pairs_lag: float = 0.0
+    """What the pairs were freed of: they need not be of the pixels that the image shows."""
     in_focus: bool = False
     """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
@@ -194,8 +212,8 @@ class EventWitnesses:
             return found
         width = width if width is not None or self.image is None else self.image.finest.width
         assert width is not None
-        if self.in_focus:
-            unexplained = min(unexplained, LAG_UNEXPLAINED_IN_FOCUS)
+        if self.in_focus:  # the lag's own error holds it
+            unexplained = 0.0
         shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
         stray = _stray(self.pairs)
         departure = 0.0
@@ -203,10 +221,12 @@ class EventWitnesses:
             departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
             dull = (1.0 + HELD_BACK * self.held_back) * width
             sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray * dull))
-            found.append(Witness("vertex", self.image.at, sigma, shared, SYSTEMATIC_IMAGE * dull))
+            held = SYSTEMATIC_IMAGE * dull
+            found.append(Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at))
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
             systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
-            found.append(Witness("pairs", self.pairs.at, float(np.hypot(self.pairs.sigma, systematic)), shared))
+            sigma = float(np.hypot(self.pairs.sigma, systematic))
+            found.append(Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag))
         return found
 
 
@@ -248,22 +268,27 @@ def ask_events(
     worth = None if soft is None else worth_of_an_event(soft, at_peak, events.margin)
     worths = WORTHS if worth is None else tuple(one / worth for one in NEAR_WORTHS)
     if soft is not None and worth is not None:
-        slownesses = [(1.0 + DARK) / (in_focus(soft, at_peak, worth, events.margin) + DARK)]
+        slownesses = _slownesses_in_focus(soft, at_peak, worth, events.margin)
     else:
-        slownesses = _slownesses(start, at_peak, slowness)
+        slownesses = [Slowness.of(one) for one in _slownesses(start, at_peak, slowness)]
     found = find_pairs(events.t_us, events.x, events.y, events.on, events.position, (events.height, events.width))
     smooth = (SMOOTH_PAIRS if worth is None else SMOOTH_IN_FOCUS) * flank_width(begin, peak)
     focused = worth is not None
-    pairs, late = _pair_mode(found, at_peak, peak, end, slownesses, unmeasured_lag, calibrated, smooth, focused=focused)
+    reach = PAIRS_REACH * flank_width(begin, peak)
+    pairs, late = _pair_mode(
+        found, at_peak, (peak, end, reach), slownesses, unmeasured_lag, calibrated, smooth, focused=focused
+    )
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * slowness)
-    if planes:
+    # Edges that move make clusters of pairs too.
+    if planes and not find_drift(rebuilt(events, groups, np.linspace(begin, end, LOOKS))).seen:
         depths = tuple(plane.at for plane in planes)
-        return EventWitnesses(None, planes[0], late.typical, 0.0, depths, flank_width(begin, peak))
+        width = flank_width(begin, peak)
+        return EventWitnesses(None, planes[0], late.typical, 0.0, depths, width, pairs_lag=late.typical.at)
     if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
         rows = busiest_rows(events, SAMPLE_PX)
         events, weight = rows_of(events, rows), weight[rows]
         at_peak, bend = at_peak[rows], bend[rows]
-        slownesses = [one[rows] for one in slownesses]
+        slownesses = [Slowness(one.times[rows], one.beyond[rows]) for one in slownesses]
         start = None if start is None else start[rows]
         groups = by_pixel(events)
     pixels = max(1, events.height * events.width)
@@ -276,28 +301,45 @@ def ask_events(
     first = _image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
     quiet = _curves(images, start, worths, weight, events.margin)
-    bands = [len(BANDS_PX) if still else GHOSTLESS_BANDS, *len(worths) * [len(BANDS_PX)]]
-    curves = quiet if still else loud + quiet
+    # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
+    # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
+    below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
+    bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(worths) * [below]]
+    curves = quiet if still else loud if drift.seen else loud + quiet
     candidates = [
         one
         for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
-        if (one := _image_focus(curve, ticks, peak, count)) is not None
+        if (one := _image_focus(curve, ticks, peak, count)) is not None and (one.as_blur or not drift.seen)
     ]
     image = average_focus(candidates) if candidates else None
     energy, turning = _who_turns(at_peak, bend, weight)
     turning = turning if focused else energy
     lags, expected = late.candidates, late.typical
     if energy.any():
-        typical = [_typical(slow, turning, energy) for slow in slownesses]
+        typical = [_typical(slow.times, turning, energy) for slow in slownesses]
         unasked = _lag_of(None, unmeasured_lag / typical[0], calibrated)
         expected = Lag(typical[0] * unasked.at, typical[0] * unasked.sigma)
         lags = [Lag(at * one.at, at * one.sigma) for at, one in zip(typical, late.candidates, strict=True)]
-    lag = average_lag(lags, late.weights)
+    lag = _as_known(lags) if focused else average_lag(lags, late.weights)
+    pairs_lag = late.typical
+    if drift.seen:
+        # Edges that move make mirrors wherever they go, those of bright pixels at other times than those of dark ones.
+        lag, pairs_lag = expected, late.unasked
+        pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - pairs_lag.at)
     if image is not None:
         image = replace(image, at=image.at - lag.at)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     held_back = LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12)
-    return EventWitnesses(image, pairs, lag, held_back, drift=drift, expected_lag=expected, in_focus=focused)
+    return EventWitnesses(
+        image,
+        pairs,
+        lag,
+        held_back,
+        drift=drift,
+        expected_lag=expected,
+        in_focus=focused,
+        pairs_lag=pairs_lag.at,
+    )
 
 
 def _who_turns(
@@ -332,6 +374,22 @@ def _by_brightness(
     smooth = cv2.GaussianBlur(brightness, (0, 0), 4.0) + np.float32(dark)
     weight = np.asarray(smooth / np.float32(smooth.mean()), dtype=np.float32)
     return weight, (1.0 + dark) / (np.maximum(brightness, 0.0).astype(np.float64) + dark)
+
+
+def _slownesses_in_focus(
+    start: NDArray[np.float32], level: NDArray[np.float32], worth: float, margin: int
+) -> list[Slowness]:
+    """Return how slow each pixel is in the picture in focus; then with worth and dark current an error off."""
+    found = []
+    for share, dark in (
+        (1.0, DARK),
+        (1.0 - WORTH_UNKNOWN, DARK),
+        (1.0 + WORTH_UNKNOWN, DARK),
+        (1.0, DARK * (1.0 - DARK_UNKNOWN)),
+        (1.0, DARK * (1.0 + DARK_UNKNOWN)),
+    ):
+        found.append(Slowness.of((1.0 + dark) / (in_focus(start, level, share * worth, margin) + dark)))
+    return found
 
 
 def _slownesses(
@@ -442,21 +500,26 @@ class _Lateness:
     weights: NDArray[np.float64]
     typical: Lag
     """What it makes of the pixels that turned, on the average."""
+    unasked: Lag
+    """The same if no pair had been asked."""
 
 
 def _pair_mode(
     pairs: Pairs,
     level: NDArray[np.float32],
-    peak: float,
-    end: float,
-    slownesses: list[NDArray[np.float64]],
+    stretch: tuple[float, float, float],
+    slownesses: list[Slowness],
     unmeasured_lag: float,
     calibrated: LagPrior | None,
     smooth: float,
     *,
     focused: bool,
 ) -> tuple[Mode | None, _Lateness]:
-    """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness."""
+    """Return the mode of the mirror pairs, freed of lag, and the lag under each candidate for slowness.
+
+    *stretch* is where the raw peak and the end lie, and how far from the mode pairs tell of the lag.
+    """
+    peak, end, reach = stretch
     curvature = cv2.Laplacian(cv2.GaussianBlur(level, (0, 0), 1.0), cv2.CV_32F)[pairs.y, pairs.x].astype(np.float64)
     past = end - peak
     # Only dark sides of edges, where slowness is known: in log intensity they turn sharply, in focus, where bright
@@ -464,16 +527,17 @@ def _pair_mode(
     # line wants both, which differ more in brightness.
     sided = (pairs.on > 0) & (curvature > 0.0) if focused else (2.0 * pairs.on - 1.0) * curvature > 0.0
     believed = sided & (pairs.after >= peak - 0.5 * past)
-    gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)
-    weights = (np.abs(curvature) / gap)[believed]
+    gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)[believed]
+    weights = np.abs(curvature)[believed] / gap
     middle = pairs.middle[believed]
     mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
     if mode is None:
-        unknown = [_lag_of(None, unmeasured_lag / float(one.mean()), calibrated) for one in slownesses]
-        return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0])
-    turns = Turns(middle, pairs.after[believed], weights, mode.at, PAIRS_KERNEL * past, smooth)
-    slow = [one[pairs.y, pairs.x][believed] for one in slownesses]
-    usual = [float(np.average(one, weights=turns.near)) for one in slow]
+        unknown = [_lag_of(None, unmeasured_lag / float(one.times.mean()), calibrated) for one in slownesses]
+        return None, _Lateness(unknown, np.ones(len(unknown)), unknown[0], unknown[0])
+    x, y = pairs.x[believed], pairs.y[believed]
+    turns = Turns(middle, gap, weights, blocks_of(x, y, level.shape), mode.at, PAIRS_KERNEL * past, reach, smooth)
+    slow = [one.at(y, x) for one in slownesses]
+    usual = [float(np.average(one.times, weights=turns.near)) for one in slow]
     drawn = [turns.line(one) for one in slow]
     lines = [line for line, _ in drawn]
     typical = [float(np.average(one, weights=turns.near)) for _, one in drawn]
@@ -491,8 +555,18 @@ def _pair_mode(
         for line, one in zip(lines, usual, strict=True)
     ]
     fit = weights_of_lines(lines)
-    lag = average_lag([Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)], fit)
-    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit, lag)
+    lags = [Lag(one.at * at, one.sigma * at) for one, at in zip(late, typical, strict=True)]
+    lag = _as_known(lags) if focused else average_lag(lags, fit)
+    nothing = _lag_of(None, unmeasured_lag / usual[0], calibrated)
+    unasked = Lag(usual[0] * nothing.at, usual[0] * nothing.sigma)
+    return replace(mode, at=mode.at - lag.at), _Lateness(late, fit, lag, unasked)
+
+
+def _as_known(lags: list[Lag]) -> Lag:
+    """Return the first of ``_slownesses_in_focus``'s lags, with what the others differ by in its error."""
+    first, *others = lags
+    apart = [0.5 * (high.at - low.at) for low, high in zip(others[::2], others[1::2], strict=True)]
+    return Lag(first.at, float(np.linalg.norm([first.sigma, *apart])))
 
 
 def _lag_of(line: Line | None, expected: float, calibrated: LagPrior | None) -> Lag:

@@ -28,6 +28,10 @@ SIGMAS = 6.0
 LEAST_PX = 0.1
 """What counts as motion: so many standard errors, and more than thresholds that differ between pixels ever feign."""
 
+SIGMAS_BETWEEN = 3.0
+"""The same between two passes: what is built in the second began as the first left it, and lies within 0.06 px of it
+where nothing moved, even if depths are mixed; so the least size tells, and an error from four quarters has to agree."""
+
 
 @dataclass(frozen=True, slots=True)
 class Drift:
@@ -43,6 +47,11 @@ class Drift:
     def seen(self) -> bool:
         """Whether the scene has certainly moved, as a whole."""
         return self.px > max(LEAST_PX, SIGMAS * self.sigma_px)
+
+    @property
+    def seen_between(self) -> bool:
+        """Whether the scene has moved between two images that two passes have built in focus."""
+        return self.px > max(LEAST_PX, SIGMAS_BETWEEN * self.sigma_px)
 
 
 def shift_px(one: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float64]:

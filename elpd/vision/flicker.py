@@ -15,6 +15,10 @@ pixels of the first half of the record are compared with themselves in the secon
 in one and another's in the other, over pairs of the same pixel, is for a lamp what it is for pairs of any pixels, and
 zero for edges. Half of that is asked for, by as many standard deviations as ``FALSE_ALARM`` takes.
 
+Stamps that lie on a grid (a camera's coarse clock, a sensor that was simulated picture by picture) are samples, and
+show no frequency above half the grid's: beyond it, what the sweep itself does slowly is seen again, as a line of the
+grid's own frequency less its own. So the bins are whole steps of the grid, and faster lines are not looked for.
+
 What a lamp does to a pixel's level is undone after a whole period, whatever its depth, as long as the pixel can follow.
 So sums over whole periods are free of it; ``residue`` says how well that holds for this sensor and this lamp.
 """
@@ -31,6 +35,9 @@ if TYPE_CHECKING:
 
 BIN_US = 250
 """Lamps of up to 1 kHz have four bins a period; a faster one is averaged away by the photoreceptors."""
+
+OFF_GRID = 0.01
+"""Share of the intervals between stamps that may be shorter than the grid on which the others lie."""
 
 HIGHEST_HZ = 1_000.0
 LOWEST_HZ = 45.0
@@ -89,12 +96,14 @@ def find_flicker(
 
 def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end_us: int) -> Flicker | None:
     """Return the strongest line in the difference of ON and OFF events, whatever makes it; else as ``find_flicker``."""
-    bins = (end_us - begin_us) // BIN_US
+    grid_us = stamp_grid_us(t_us)
+    bin_us = -(-BIN_US // grid_us) * grid_us
+    bins = (end_us - begin_us) // bin_us
     if bins < 8:
         return None
-    span_s = 1e-6 * BIN_US * bins
-    inside = (t_us >= begin_us) & (t_us < begin_us + bins * BIN_US)
-    which, sign = (t_us[inside] - begin_us) // BIN_US, 2.0 * on[inside] - 1.0
+    span_s = 1e-6 * bin_us * bins
+    inside = (t_us >= begin_us) & (t_us < begin_us + bins * bin_us)
+    which, sign = (t_us[inside] - begin_us) // bin_us, 2.0 * on[inside] - 1.0
     count = np.bincount(which, minlength=bins).astype(np.float64)
     if count.sum() < 2.0 / LEAST_SHARE**2:
         return None
@@ -102,12 +111,14 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
     swing = np.bincount(which, weights=sign, minlength=bins) - mean * count
     taper = np.sin(np.pi * (np.arange(bins) + 0.5) / bins) ** 2
     lowest = max(LOWEST_HZ, FEWEST_PERIODS / span_s)
-    if lowest >= HIGHEST_HZ:
+    highest = min(HIGHEST_HZ, 0.5e6 / bin_us)
+    if lowest >= highest:
         return None
-    independent = max(1.0, (HIGHEST_HZ - lowest) * span_s)
-    frequencies = np.linspace(lowest, HIGHEST_HZ, int(STEPS_PER_RESOLUTION * independent) + 2)
-    turns = np.exp(-2j * np.pi * 1e-6 * BIN_US * np.outer(frequencies, np.arange(bins)))
-    amplitude = np.abs(turns @ (taper * swing))
+    independent = max(1.0, (highest - lowest) * span_s)
+    finer = STEPS_PER_RESOLUTION * bins
+    frequencies = np.fft.rfftfreq(finer, 1e-6 * bin_us).astype(np.float64)
+    within = (frequencies >= lowest) & (frequencies <= highest)
+    frequencies, amplitude = frequencies[within], np.abs(np.fft.rfft(taper * swing, finer)[within])
     variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
     power = amplitude**2 / max(variance, 1e-12)
     power /= max(1.0, float(np.median(power)) / np.log(2.0))
@@ -117,6 +128,15 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
     if false_alarm > FALSE_ALARM or share < LEAST_SHARE:
         return None
     return Flicker(_refined(frequencies, power, top), min(share, 1.0), false_alarm)
+
+
+def stamp_grid_us(t_us: NDArray[np.int64]) -> int:
+    """Return the step of the grid on which stamps lie, in any order: what is between all but ``OFF_GRID`` of them.
+
+    One where there are none, and no more than a few microseconds where a clock is as fine as that.
+    """
+    stamps = np.unique(t_us)
+    return int(np.quantile(np.diff(stamps), OFF_GRID, method="lower")) if stamps.size > 1 else 1
 
 
 def _recurs(

@@ -9,6 +9,7 @@ picture, and the vertex does not depend on the start picture.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from elpd.records import Geometry, Roi, SensorProfile
     from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
+    from elpd.vision.integral import Vertex
     from elpd.vision.ruler import Ruler
 
 MIN_EVENTS = 1_000
@@ -39,14 +41,11 @@ MIN_EVENTS = 1_000
 MAX_EVENTS = 1 << 23
 """What is kept at most: 13 bytes each."""
 
-MAINS_HZ = 250.0
-"""Lamps on mains flicker at 100 or 120 Hz; faster lines may be the grid of the time stamps themselves."""
-
 FIRST_CAPACITY = 1 << 17
 
 LEAST_ORDER = 0.75
-"""Energy of the image over that of the same number of random events. Still scenes have 1 to 30 and the paper's violent
-motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
+"""Energy that the image has won over that of the same number of random events. Still scenes have 1 to 30 and the
+paper's violent motion 2 to 15; below one, motion has shuffled the events more than focus has ordered them."""
 
 MIN_RISE = 0.30
 """Without frames the curve starts from nothing, so its first wiggles are noise; a peak stands higher."""
@@ -142,6 +141,12 @@ class EventMemory:
         stamp_events(x[part], y[part], on[part], POINT, levels)
         return BuiltImage(levels, self._forgotten + self._count)
 
+    def sharpest(self) -> NDArray[np.float32]:
+        """Return the image at the peak of the curve, (height, width) in thresholds."""
+        until = int(np.searchsorted(self._t_us, self.track.times_us[self.track.peak], side="left"))
+        nothing = BuiltImage(np.zeros(self._shape, np.float32), 0)
+        return self._upon(nothing if self._start is None else self._start, until)
+
     def change(self) -> NDArray[np.float32]:
         """Return what the events of this memory alone have built, those after the last ``advance`` too."""
         levels = self.built().levels
@@ -232,12 +237,20 @@ class EventMemory:
         return self._taken - int(np.searchsorted(self._t_us, begin_us, side="left")) >= MIN_EVENTS
 
     def _shows_a_picture(self) -> bool:
-        """Whether the image is sharper, at its peak, than as many events at random would have made it."""
+        """Whether the image has become sharper, up to its peak, than as many events at random would have made it.
+
+        Counted from the curve's lowest point on: what earlier passes and motion have shuffled before stays in the image
+        on both sides of the peak.
+        """
         track = self.track
+        energies = np.exp(track.values[: track.peak + 1])
+        lowest = int(np.argmin(energies))
+        begin, end = (int(np.searchsorted(self._t_us, track.times_us[k], side="left")) for k in (lowest, track.peak))
+        begin = 0 if lowest == 0 else begin
         height, width = self._shape
-        until = int(np.searchsorted(self._t_us, track.times_us[track.peak], side="left")) + self._forgotten
-        at_random = band_gain(BANDS_PX[0]) * until / (height * width)
-        return float(np.exp(track.values[track.peak])) > LEAST_ORDER * at_random
+        at_random = band_gain(BANDS_PX[0]) * (end - begin) / (height * width)
+        gained = float(energies[-1]) - (0.0 if self._start is None and lowest == 0 else float(energies[lowest]))
+        return gained > LEAST_ORDER * at_random
 
     def ask(
         self,
@@ -271,7 +284,7 @@ class EventMemory:
         position = sign * ruler.at(self._t_us[part] + round(deaf_us))
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
-        base = None if self._start is None else self._start.levels
+        base = None if self._start is None else self._upon(self._start, begin)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base)
         if begin > 0 or self._forgotten:
             start = None
@@ -289,6 +302,13 @@ class EventMemory:
             hurried=hurried,
         )
 
+    def _upon(self, start: BuiltImage, count: int) -> NDArray[np.float32]:
+        """Return what the first *count* events have made of the image at the start."""
+        levels = start.levels.copy()
+        _, x, y, on = (column[:count] for column in self._columns)
+        stamp_events(x, y, on, POINT, levels)
+        return levels
+
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
         if picture is None:
@@ -305,7 +325,7 @@ class EventMemory:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
         lamp = self.flicker()
-        if lamp is not None and lamp.frequency_hz < MAINS_HZ:
+        if lamp is not None:
             # What makes pairs of bright pixels differ from those of dark ones is the lamp then, not the lag.
             brightness = start = None
         said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
@@ -313,14 +333,45 @@ class EventMemory:
         if said is None or (said.image is None and not said.depths):
             return [], None
         _, _, sign = ruler.stretch(now_us)
+        if lamp is not None:
+            said = self._dithered(said, lamp, now_us, ruler)
         undated = deaf.sigma_us * ruler.speed_at(now_us)
         self.depths = tuple(sign * at for at in said.depths)
         width = said.plane_width if said.image is None else said.image.finest.width
         witnesses = [
             replace(one, at=sign * one.at, shared=float(np.hypot(one.shared, undated)))
             for one in said.witnesses(width=width)
+            if lamp is None or said.depths or one.name != "pairs"
         ]
         return witnesses, width
+
+    def _dithered(self, said: EventWitnesses, lamp: Flicker, now_us: int, ruler: Ruler) -> EventWitnesses:
+        """Return what the events say, for a lamp that swings the levels to and fro between the thresholds.
+
+        A pixel that has turned need not come back by a whole threshold then: the lamp carries it there. So turns that
+        are put back by one, as in the rebuilt image, come too early, and turns as they are, in the levels at the end of
+        each of the lamp's periods, too late; where between the two depends on the lamp's swing over the thresholds.
+        Pairs are as early and are not asked.
+        """
+        raw = self._by_periods(lamp, now_us, ruler)
+        if said.image is None or raw is None:
+            return said
+        _, _, sign = ruler.stretch(now_us)
+        early, late = said.image.at, sign * raw.at - said.lag.at
+        between = float(np.hypot(said.image.sigma, (late - early) / sqrt(12.0)))
+        return replace(said, image=replace(said.image, at=0.5 * (early + late), sigma=between))
+
+    def _by_periods(self, lamp: Flicker, now_us: int, ruler: Ruler) -> Vertex | None:
+        """Return the vertex of log S of the image at the end of each of a lamp's periods, dated to their middle."""
+        t_us, x, y, on = (column[: self._taken] for column in self._columns)
+        ends_us = np.arange(float(now_us), float(t_us[0]), -lamp.period_us)[::-1]
+        energy = EventEnergy(*self._shape, ROI_MARGIN_PX, None if self._start is None else self._start.levels)
+        track, done = PeakTrack(), 0
+        for end_us, until in zip(ends_us, np.searchsorted(t_us, ends_us), strict=True):
+            energy.add(x[done:until], y[done:until], on[done:until])
+            done = until
+            track.add(round(end_us), ruler.position(round(end_us - 0.5 * lamp.period_us)), energy.measure())
+        return track.vertex()
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:

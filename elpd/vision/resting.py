@@ -101,6 +101,8 @@ class Resting:
         """Where the scene moves, what has been built: upon a frame, or by the events alone."""
         self.beneath: NDArray[np.float32] | None = None
         """What that image lacks of being a picture of the scene, where motion is only suspected too."""
+        self.only_picture: NDArray[np.float32] | None = None
+        """Where the scene stood still, the picture that no frame will replace, as ``beneath``."""
         self.unrest: Unrest | None = None
         """What motion alone does to the sharpness of the two together; ``None`` where there is no picture."""
 
@@ -187,6 +189,8 @@ class Resting:
         found = order(levels)
         self.moves = found > SIGMAS_OF_MOTION
         if found <= SIGMAS_OF_SUSPICION:
+            if self._frame is None and self._picture is not None:
+                self.only_picture = self._cut(self._picture())
             return
         built, before = BuiltImage(levels, t_us.size), None
         if self._frame is not None:

@@ -179,8 +179,9 @@ def frame_levels(pixels: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 class FrameEnergy:
-    """``log S`` of whole frames over a region, weighted by the brightness of the first.
+    """``log S`` of whole frames over a region, weighted by the brightness of each.
 
+    (That of the first would stay where it is while the scene goes on: bright parts in dark ones' place tilt the curve.)
     With *follow* the region goes with the scene, from frame to frame by phase correlation, as far as the margin lets
     it: what a shaking hand moves in and out of a region that stands still would pass for focus.
     """
@@ -191,7 +192,6 @@ class FrameEnergy:
         self._follow = follow
         self._before: NDArray[np.float32] | None = None
         self._shift_px = np.zeros(2)
-        self._weight: NDArray[np.float32] | None = None
 
     def measure(self, pixels: NDArray[np.generic]) -> NDArray[np.float64]:
         """Return log S of a frame, 8 or 16 bit, in each band."""
@@ -200,13 +200,12 @@ class FrameEnergy:
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
         scale = full_scale(pixels) or 1.0
         image = part.astype(np.float32) / np.float32(scale)
-        if self._weight is None:
-            smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(1e-6)
-            self._weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
+        smooth = cv2.GaussianBlur(image, (0, 0), 4.0) + np.float32(1e-6)
+        weight = np.asarray(smooth / smooth.mean(), dtype=np.float32)
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
         levels = np.log(image + np.float32(FRAME_GROUND))
-        energies = band_energies(levels, self._weight * self._moved(inside, levels))
+        energies = band_energies(levels, weight * self._moved(inside, levels))
         return np.asarray(np.log(energies + _FLOOR))
 
     def _moved(self, inside: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -42,6 +42,28 @@ def test_where_one_pass_is_not_enough_a_second_is_made_and_its_time_is_told() ->
     assert told_ms["recross"] > 20.0
 
 
+@pytest.mark.parametrize("start_um", [-200.0, 200.0])
+def test_a_second_pass_is_the_way_back_and_ends_where_focus_has_been_seen_to_pass(start_um: float) -> None:
+    """From 200 um away: the ramp and 50 ms of sweep, the turn, 20 ms back over focus, 20 ms to it."""
+    story = shown("violent", 3, start_um)
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert story.result.details["method"] == "two_crossings"
+    told_ms = {phase.name: phase.ms for phase in story.result.phases}
+    assert told_ms["recross"] < 60.0
+    if not story.result.reversals:
+        assert sum(told_ms[name] for name in ("sweep", "stop", "recross", "return", "verify")) < 160.0
+
+
+def test_a_doubtful_answer_is_looked_at_again_and_a_scene_that_lies_elsewhere_then_moves() -> None:
+    story = shown("violent", 902)
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert story.result.details["method"] == "two_crossings"
+    begun = next(fields for fields in story.named("one pass"))
+    assert begun["sigma_um"] > story.settings.max_sigma_dof * story.settings.depth_of_focus_um
+
+
 def test_where_one_pass_is_enough_no_second_is_made() -> None:
     story = shown("static", 1)
     assert story.outcome is Outcome.FOCUSED

@@ -238,3 +238,13 @@ def test_a_region_that_goes_with_its_scene_sees_the_same_sharpness() -> None:
     followed = [follows.measure(frame) for frame in frames]
     stood = [stands.measure(frame) for frame in frames]
     assert (np.ptp(followed, axis=0) < 0.5 * np.ptp(stood, axis=0)).all()
+
+
+def test_bright_parts_that_move_are_as_sharp_elsewhere() -> None:
+    rng = np.random.default_rng(7)
+    picture = 60.0 * np.exp(0.2 * cv2.GaussianBlur(rng.standard_normal((96, 96)), (0, 0), 1.0) / 0.28)
+    picture[:, 12:40] *= 3.0
+    picture[:, 40:] = cv2.GaussianBlur(picture[:, 40:], (0, 0), 4.0)  # dark parts have less structure
+    energy = FrameEnergy(Roi(0, 0, 96, 96), 0)
+    still, moved = (energy.measure(np.roll(picture, k, axis=1).clip(0, 255).astype(np.uint8)) for k in (0, 30))
+    np.testing.assert_allclose(moved, still, atol=0.03)  # whatever lies under where bright parts were at first

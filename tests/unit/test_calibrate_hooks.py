@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
+from scenes_of_turns import turns_of_a_lag
 
 from elpd.records import Geometry, Roi, SensorProfile
 from elpd.vision.filters import PixelCap
-from elpd.vision.lag import Lag, LagPrior, Line, line_of_classes
+from elpd.vision.lag import Lag, LagPrior
 from elpd.vision.memory import EventMemory
+
+if TYPE_CHECKING:
+    from elpd.vision.turns import Line
 
 GEOMETRY = Geometry(64, 48)
 
@@ -37,11 +43,9 @@ def test_the_memory_leaves_hot_pixels_of_its_region_out() -> None:
 
 
 def pairs_line(lag_um: float, spread: float, seed: int) -> Line | None:
-    """What pairs say of a scene whose pixels are 1 to *spread* times slower than the brightest; focus at 10 um."""
-    random = np.random.default_rng(seed)
-    slowness = random.uniform(1.0, spread, 400)
-    middle = 10.0 + lag_um * slowness + random.normal(0.0, 0.5, 400)
-    return line_of_classes(middle, np.ones(400), slowness, 10.0 + lag_um, 5.0)
+    """What pairs say of a scene whose pixels are up to *spread* times slower than the brightest."""
+    turns, slowness = turns_of_a_lag(lag_um, spread=spread, seed=seed)
+    return turns.line(slowness)[0]
 
 
 @pytest.mark.parametrize("seed", range(5))

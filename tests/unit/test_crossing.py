@@ -1,6 +1,5 @@
 """The rebuilt image against its twin, the vertex, and how witnesses are fused."""
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -23,7 +22,6 @@ from elpd.vision.integral import (
     rebuild_levels,
     stamp_events,
 )
-from elpd.vision.lag import Lag, Turns, average_lag, expected_lag, line_of_classes, weights_of_lines
 from elpd.vision.track import EventEnergy, PeakTrack
 
 
@@ -155,95 +153,6 @@ def test_images_of_a_scene_that_moved_lie_beside_each_other() -> None:
 def test_frames_far_apart_are_trusted_less() -> None:
     focus = BandFocus(0.0, 0.5, Vertex(0.0, 0.5, 80.0, 5), 0.0, 0.1)
     assert frame_witness(focus, 80.0).sigma > 3.0 * frame_witness(focus, 16.0).sigma
-
-
-def pairs_of_a_lag(lag: float, spread: float = 1.0) -> Any:
-    rng = np.random.default_rng(11)
-    slowness = rng.uniform(1.0, 20.0, 4000)
-    middle = 50.0 + lag * slowness + rng.normal(0.0, spread, slowness.size)
-    return middle, np.ones(middle.size), slowness, float(np.median(middle)), 2.0
-
-
-def test_the_lag_of_dark_pixels_is_measured() -> None:
-    line = line_of_classes(*pairs_of_a_lag(0.15))
-    assert line is not None
-    assert line.slope == pytest.approx(0.15, abs=3.0 * line.sigma)
-    lag = expected_lag(line, median=1.0)
-    assert lag.at == pytest.approx(line.slope, abs=0.01)
-    assert lag.sigma == pytest.approx(line.sigma, rel=0.1)
-
-
-def test_slow_pixels_are_less_late_than_their_slowness_where_their_pairs_come_soon_after_focus() -> None:
-    rng = np.random.default_rng(5)
-    slowness = rng.uniform(1.0, 20.0, 4000)
-    reach = rng.uniform(10.0, 40.0, slowness.size)  # to the later half of the pair, which then is as late
-    focus, lag = 50.0, 1.5
-    after = np.full(slowness.size, focus)
-    for _ in range(40):
-        late = lag * slowness * -np.expm1(-(after - focus) / (lag * slowness))
-        after = 0.5 * after + 0.5 * (focus + reach + late)
-    middle = focus + late + rng.normal(0.0, 0.5, slowness.size)
-    turns = Turns(middle, after, np.ones(slowness.size), float(np.median(middle)), 8.0)
-    plain = line_of_classes(middle, turns.weights, slowness, turns.mode, turns.width)
-    line, effective = turns.line(slowness)
-    assert plain is not None
-    assert line is not None
-    assert plain.slope < 0.8 * lag
-    assert line.slope == pytest.approx(lag, rel=0.1)
-    assert turns.mode - line.slope * float(effective.mean()) == pytest.approx(focus, abs=1.5)
-    assert abs(turns.mode - plain.slope * float(slowness.mean()) - focus) > 1.7
-    assert turns.share(line, effective) > 0.95
-
-
-def test_a_line_that_bending_makes_no_better_stays_straight() -> None:
-    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
-    turns = Turns(middle, middle + 500.0, weights, mode, width)
-    line, effective = turns.line(slowness)
-    assert line is not None
-    assert effective == pytest.approx(slowness, rel=1e-6)
-    assert turns.share(None, effective) == 0.0
-
-
-def test_what_is_smooth_in_brightness_and_no_lag_is_in_the_error_of_the_line() -> None:
-    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
-    bare = line_of_classes(middle, weights, slowness, mode, width)
-    doubted = line_of_classes(middle, weights, slowness, mode, width, smooth=0.6)
-    assert bare is not None
-    assert doubted is not None
-    assert doubted.slope == bare.slope
-    assert doubted.sigma > 3.0 * bare.sigma
-    # A picture of wider brightness tells the two apart better.
-    wide = line_of_classes(middle, weights, 4.0 * slowness, mode, width, smooth=0.6)
-    assert wide is not None
-    assert wide.sigma == pytest.approx(doubted.sigma / 4.0)
-    # Nothing else is left to say than what is known of photoreceptors.
-    assert expected_lag(replace(bare, sigma=1e3), 1.0).at == pytest.approx(expected_lag(None, 1.0).at, rel=0.01)
-
-
-def test_a_lag_is_never_negative_and_unmeasured_is_what_may_be_expected() -> None:
-    line = line_of_classes(*pairs_of_a_lag(-0.1))
-    assert line is not None
-    assert line.slope < 0.0
-    assert 0.0 <= expected_lag(line, median=1.0).at < line.sigma
-    unmeasured = expected_lag(None, median=0.7)
-    assert unmeasured.at == pytest.approx(0.7 * np.exp(0.5 * (0.5 * np.log(10.0)) ** 2), rel=1e-3)
-    assert unmeasured.sigma > 3.0 * 0.7, "a lag of five times the usual one is no surprise"
-    assert expected_lag(None, median=0.0) == Lag()
-    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
-    assert line_of_classes(middle, weights, np.ones_like(slowness), mode, width) is None
-    assert line_of_classes(middle[:20], weights[:20], slowness[:20], mode, width) is None
-
-
-def test_the_slowness_that_explains_the_pairs_has_the_say() -> None:
-    middle, weights, slowness, mode, width = pairs_of_a_lag(0.15)
-    shuffled = np.random.default_rng(3).permutation(slowness)
-    lines = [line_of_classes(middle, weights, one, mode, width) for one in (slowness, shuffled)]
-    share = weights_of_lines(lines)
-    assert share[0] > 0.7
-    assert weights_of_lines([None, None]).tolist() == [0.5, 0.5]
-    both = average_lag([Lag(1.0, 0.1), Lag(3.0, 0.1)], np.array([1.0, 1.0]))
-    assert both.at == pytest.approx(2.0)
-    assert both.sigma == pytest.approx(1.0, abs=0.01)
 
 
 def test_white_noise_has_no_energy_in_any_band() -> None:

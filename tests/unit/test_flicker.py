@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elpd.records import Geometry, Roi
-from elpd.vision.flicker import FALSE_ALARM, find_flicker, find_line, residue
+from elpd.vision.flicker import FALSE_ALARM, find_flicker, find_line, residue, stamp_grid_us
 from elpd.vision.resting import Resting, hot_pixels
 from elpd.vision.whole_periods import WholePeriods
 
@@ -90,6 +90,23 @@ def test_pixels_that_are_all_left_behind_by_the_middle_show_no_lamp() -> None:
 def test_a_lamp_is_found_although_an_edge_goes_by() -> None:
     t, pixel, on = (np.concatenate(two) for two in zip(lamp(100.0), passing(15, 300.0), strict=True))
     assert find_flicker(t, pixel, on, 0, SPAN_US) is not None
+
+
+@pytest.mark.parametrize("grid_us", [1000, 1000 / 3, 500, 250, 200])
+def test_the_grid_of_a_coarse_clock_is_no_lamp_and_hides_none(grid_us: float) -> None:
+    t, pixel, on = lamp(2.0, depth=40.0)  # what a sweep does: every pixel once up and down
+    stamps = np.rint(np.ceil(t / grid_us) * grid_us).astype(np.int64)
+    assert stamp_grid_us(stamps) == int(grid_us)
+    assert find_line(stamps, on, 0, SPAN_US) is None
+    t, pixel, on = lamp(100.0)
+    found = find_flicker(np.rint(np.ceil(t / grid_us) * grid_us).astype(np.int64), pixel, on, 0, SPAN_US)
+    assert found is not None
+    assert found.frequency_hz == pytest.approx(100.0, rel=5e-3)
+
+
+def test_stamps_at_random_lie_on_no_grid() -> None:
+    assert stamp_grid_us(noise(2, 3000)[0]) == 1
+    assert stamp_grid_us(np.array([7], dtype=np.int64)) == 1
 
 
 def test_whole_periods_of_pixels_that_follow_leave_nothing_and_others_are_seen() -> None:

@@ -120,6 +120,29 @@ def test_an_absolute_target_does_not_depend_on_when_the_motion_began() -> None:
     assert motor.at_rest_from() == pytest.approx(10e6 + 60e6, rel=1e-3)
 
 
+def test_a_rounding_that_is_the_same_each_time_is_not_averaged_away() -> None:
+    motor = trajectory()
+    motor.observe(report(0, 0))
+    motor.command(Motion(math.inf, 10_000.0), 10_000_000, 1e6)
+    for n in range(1, 40):  # every 4 ms it is told where it was 0.45 steps ago: no speed tells more
+        motor.observe(report(40 * n - 0.45, 10 + 4 * n, moving=True))
+    asked = motor.position_at(HostNs(90_000_000))
+    assert abs(asked.steps - 800.0) < 1.96 * asked.sigma_steps
+    assert asked.sigma_steps < 0.5, "nor is it taken for more than it is"
+
+
+def test_a_command_that_may_have_begun_early_makes_the_moments_before_it_vague() -> None:
+    motor = trajectory()
+    motor.observe(report(0, 0))
+    motor.command(Motion(math.inf, 10_000.0), 10_000_000, 0.0)
+    motor.command(REST, 110_000_000, 3e6)
+    sure, vague = motor.position_at(HostNs(100_000_000)), motor.position_at(HostNs(109_000_000))
+    assert sure.sigma_steps < 0.5
+    assert vague.sigma_steps == pytest.approx(10_000 * (6.0 - 1.0) / 1000 / 2, rel=0.05)
+    motor.observe(report(970, 130))  # it had stopped 3 ms early
+    assert motor.position_at(HostNs(109_000_000)).steps == pytest.approx(970, abs=1.0)
+
+
 def test_the_same_calls_give_the_same_bits() -> None:
     def once() -> list[float]:
         made = rig("grbl", seed=5)

@@ -99,6 +99,8 @@ def all_methods() -> dict[str, Method]:
             rates: tuple[str, ...] = (NO_FRAMES,)
         elif name == "elp-syn-1fps":
             rates = ("1",)
+        elif name == "registered":
+            rates = ("50", "20", "1", MAP)
         else:
             # One frame has no contrast to compare with, and the released programs at 1 fps are the method above.
             rates = ("50", "20", MAP, REBUILT, E2VID) if name == "elp-evk4" else ("50", "20")
