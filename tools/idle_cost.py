@@ -3,7 +3,7 @@
 Printed, not asserted. Each row is an `elpd serve` of its own. *Start*: from its call to READY, in seconds of the wall
 clock and of processor time, with kernels from the cache or (cold) compiled anew. *Idle*: processor time in per cent of
 one core, for so many seconds in which nobody asks, and with one client that listens to all events and asks for the
-status twice a second. *Memory*, MB, once READY: resident, of which private to this process (the rest is the files of
+status twice a second. Two processes that compile beside it count with the start. *Memory*, MB, once READY: resident, of which private to this process (the rest is the files of
 libraries, shared and given back when memory is short).
 
 The simulated rig computes its world in the same process. `recording` is a rig without one: a resting sensor's noise as
@@ -78,7 +78,7 @@ def cost(
 ) -> dict[str, Any]:
     """Run a daemon and return what it costs."""
     with daemon(folder, environment or {}, settings) as (process, path, start_s):
-        row: dict[str, Any] = {"name": name, "start_s": start_s, "start_cpu_s": processor_s(process)}
+        row: dict[str, Any] = {"name": name, "start_s": start_s, "start_cpu_s": processor_s(process, with_children=True)}
         row["ready"] = memory_mb(process)
         time.sleep(SETTLED_S)
         row["idle_percent"] = _percent(process, seconds, time.sleep)
