@@ -52,8 +52,13 @@ def sweep(
     shake_px: float = 0.0,
     scene: np.ndarray | None = None,
     step_us: int = 200,
+    lamp_hz: float = 0.0,
+    lamp_depth: float = 0.0,
 ) -> World:
-    """Sweep the lens from *start_um* to *end_um* (focus is at zero) and return what the camera saw."""
+    """Sweep the lens from *start_um* to *end_um* (focus is at zero) and return what the camera saw.
+
+    The light swings by *lamp_depth* of itself at *lamp_hz*.
+    """
     rng = np.random.default_rng(seed + 1)
     scene = picture(size, seed) if scene is None else scene
     duration_us = abs(end_um - start_um) / speed_um_s * 1e6
@@ -73,6 +78,7 @@ def sweep(
             moved = cv2.warpAffine(scene, matrix, (size, size), borderMode=cv2.BORDER_WRAP)
         sigma = float(np.hypot(least_blur_px, blur_px_per_um * z))
         image = cv2.GaussianBlur(moved, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+        image *= 1.0 + lamp_depth * np.sin(2e-6 * np.pi * lamp_hz * now_us)
         if frame_every_us is not None and now_us >= next_frame_us:
             frames.append((now_us, np.clip(np.rint(image), 0, 255).astype(np.uint8)))
             next_frame_us += frame_every_us

@@ -18,8 +18,6 @@ loop that only looks at the clock.
 from __future__ import annotations
 
 import argparse
-import ctypes
-import gc
 import json
 import multiprocessing
 import os
@@ -39,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from elpd_drivers.lenses.serial_port import SerialPort
 from speed import stream
+from speed.machine import noise_floor, realtime
 
 from elpd import rig
 from elpd.config import load
@@ -54,7 +53,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-PRIORITY = 70
 SWITCH_S = 5e-5
 WINDOW_US = 1000
 SENSOR = Geometry(1280, 720)
@@ -278,40 +276,7 @@ def stream_words(path: Path | None, n_words: int) -> tuple[Geometry, NDArray[np.
     return SENSOR, stream.tiled(words, SENSOR, n_words)[:n_words]
 
 
-# --- the machine ---------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def realtime() -> Iterator[str | None]:
-    """Ask for SCHED_FIFO and locked memory; yield why not, where it is refused."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    except PermissionError:
-        yield "SCHED_FIFO was refused (needs CAP_SYS_NICE or LimitRTPRIO)"
-        return
-    libc.mlockall(7)  # as the service does: what is touched stays
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield None
-    finally:
-        gc.enable()
-        gc.unfreeze()
-        libc.munlockall()
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
-def noise_floor(seconds: float = 0.5) -> NDArray[np.float64]:
-    """Return the gaps between looks at the clock, in microseconds: what the machine alone takes away."""
-    gaps = []
-    before = begun = time.monotonic_ns()
-    while before - begun < seconds * 1e9:
-        now = time.monotonic_ns()
-        gaps.append((now - before) / 1e3)
-        before = now
-    return np.array(gaps)
+# --- telling -------------------------------------------------------------------------------------------------------
 
 
 def _summary(name: str, spent_us: NDArray[np.float64]) -> dict[str, float]:

@@ -1,17 +1,12 @@
-"""A lens's calibration as a picture: ways over speeds, what is left of them, replies, the ruler.
-
-Drawn with matplotlib, which is imported here, when a picture is asked for.
-"""
+"""A lens's calibration as a picture: ways over speeds, what is left of them, replies, the ruler."""
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.calibrate.plot import BLUE, GREY, INK, RED
-from elpd.errors import UsageError
+from elpd.calibrate.figure import BLUE, GREY, INK, RED, head, nothing, sheet, write
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,32 +18,22 @@ if TYPE_CHECKING:
 
 def draw_lens(path: Path, found: LensCalibration, round_trips_ns: Sequence[int] = ()) -> None:
     """Write the picture. Raises ``UsageError`` without matplotlib or where the file cannot be written."""
-    try:
-        figure = importlib.import_module("matplotlib.figure").Figure(figsize=(11.0, 7.6), layout="constrained")
-    except ImportError as error:
-        raise UsageError(
-            f"a picture takes matplotlib ({error}); pip install 'elpd[plots]', or leave --plot out"
-        ) from None
-    figure.patch.set_facecolor("white")
+    figure = sheet(f"{found.on.device}, measured {found.measured_utc}")
     ((ramped, abrupt), (replies, ruler)) = figure.subplots(2, 2)
-    figure.suptitle(f"{found.on.device}, measured {found.measured_utc}", color=INK, fontsize=11)
     stopping = found.stopping
     _ways(ramped, "stop on a ramp", None if stopping is None else stopping.ramped)
     _ways(abrupt, "stop at once", None if stopping is None else stopping.abrupt)
     _replies(replies, found, round_trips_ns)
     _ruler(ruler, found)
-    try:
-        figure.savefig(path, dpi=120, format="png")
-    except OSError as error:
-        raise UsageError(f"{path}: the picture cannot be written ({error.strerror or error})") from None
+    write(figure, path)
 
 
 def _ways(axes: Any, title: str, found: ModeFound | None) -> None:
     if found is None:
-        _head(axes, title, "not tried")
+        nothing(axes, title, "not tried")
         return
     text = f"onset {found.onset_ms}\nfrom stop to stop {found.onset_scatter_ms}\nbraking {found.deceleration_sps2}"
-    _head(axes, title, text)
+    head(axes, title, text)
     onset_s, braking = 1e-3 * (found.onset_ms.value or 0.0), found.deceleration_sps2.value
     for sign, colour, word in ((1, BLUE, "up"), (-1, RED, "down")):
         rows = [one for one in found.ways if one.speed_sps * sign > 0]
@@ -66,6 +51,7 @@ def _ways(axes: Any, title: str, found: ModeFound | None) -> None:
         speed = np.linspace(0.0, max(abs(one.speed_sps) for one in found.ways), 100)
         ramp = 0.0 if braking is None else speed**2 / (2.0 * braking)
         axes.plot(speed, speed * onset_s + ramp, color=GREY, lw=1.2)
+        axes.set_ylim(top=1.4 * axes.get_ylim()[1])  # room for the words
         axes.legend(loc="lower right", frameon=False, fontsize=8)
     axes.set_xlabel("speed, steps/s", color=INK)
     axes.set_ylabel("way after the stop, steps", color=INK)
@@ -74,31 +60,23 @@ def _ways(axes: Any, title: str, found: ModeFound | None) -> None:
 def _replies(axes: Any, found: LensCalibration, round_trips_ns: Sequence[int]) -> None:
     stopping = found.stopping
     if stopping is None or not round_trips_ns:
-        _head(axes, "replies", "not measured")
+        nothing(axes, "replies", "not measured")
         return
-    _head(axes, "replies", f"median {stopping.round_trip_ms}\njitter {stopping.round_trip_jitter_ms}")
+    head(axes, "replies", f"median {stopping.round_trip_ms}\njitter {stopping.round_trip_jitter_ms}")
     axes.hist(1e-6 * np.array(round_trips_ns, np.float64), bins=60, color=BLUE)
     axes.set_yscale("log")
+    axes.set_ylim(top=20 * axes.get_ylim()[1])  # room for the words
     axes.set_xlabel("from a question's end to its answer's beginning, ms", color=INK)
     axes.set_ylabel("replies", color=INK)
 
 
 def _ruler(axes: Any, found: LensCalibration) -> None:
     if not found.steps_to_um:
-        _head(axes, "ruler", "one length for every step (no table)")
+        nothing(axes, "ruler", "one length for every step (no table)")
         return
     steps, um = np.array(found.steps_to_um).T
     mean = (um[-1] - um[0]) / (steps[-1] - steps[0])
-    _head(axes, "ruler", f"{steps.size} rows, {mean:.4g} um a step on average")
+    head(axes, "ruler", f"{steps.size} rows, {mean:.4g} um a step on average")
     axes.plot(steps, um - um[0] - mean * (steps - steps[0]), "o-", color=BLUE, ms=4)
     axes.set_xlabel("steps", color=INK)
     axes.set_ylabel("away from a straight line, um", color=INK)
-
-
-def _head(axes: Any, title: str, text: str) -> None:
-    axes.set_title(title, color=INK, fontsize=10, loc="left", fontweight="bold")
-    axes.tick_params(colors=INK, labelsize=8)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=8.5, color=INK, wrap=True, bbox=box)

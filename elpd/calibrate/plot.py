@@ -1,17 +1,13 @@
-"""A calibration as a picture: the sensor at rest, its counts, its thresholds' balance, its lag.
-
-Drawn with matplotlib, which nothing else needs: it is imported here, when a picture is asked for.
-"""
+"""A sensor's calibration as a picture: the sensor at rest, its counts, its thresholds' balance, its lag."""
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.calibrate.figure import BLUE, GREY, INK, RED, sheet, write
 from elpd.calibrate.lag import slowness_of
-from elpd.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,31 +16,18 @@ if TYPE_CHECKING:
     from elpd.calibrate.quantity import Quantity
     from elpd.calibrate.sensor import SensorCalibration
 
-INK, BLUE, RED, GREY = "#222222", "#1f5fa8", "#b23a2e", "#9a9a9a"
 MOST_RINGS = 60
 
 
 def draw(path: Path, found: SensorCalibration, evidence: Evidence) -> None:
     """Write the picture. Raises ``UsageError`` without matplotlib or where the file cannot be written."""
-    try:
-        figure = importlib.import_module("matplotlib.figure").Figure(figsize=(11.0, 7.6), layout="constrained")
-    except ImportError as error:
-        raise UsageError(
-            f"a picture takes matplotlib ({error}); pip install 'elpd[plots]', or leave --plot out"
-        ) from None
-    figure.patch.set_facecolor("white")
+    figure = sheet(f"{found.on.device}, {found.on.width}x{found.on.height}, measured {found.measured_utc}")
     ((rest, counts), (balance, lag)) = figure.subplots(2, 2)
-    figure.suptitle(
-        f"{found.on.device}, {found.on.width}x{found.on.height}, measured {found.measured_utc}", color=INK, fontsize=11
-    )
     _rest(rest, found, evidence)
     _counts(counts, found, evidence)
     _balance(balance, found, evidence)
     _lag(lag, found)
-    try:
-        figure.savefig(path, dpi=120, format="png")
-    except OSError as error:
-        raise UsageError(f"{path}: the picture cannot be written ({error.strerror or error})") from None
+    write(figure, path)
 
 
 def _rest(axes: Any, found: SensorCalibration, evidence: Evidence) -> None:

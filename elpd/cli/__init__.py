@@ -105,7 +105,9 @@ def main() -> None:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except click.ClickException as error:
-        report_error("UsageError", f"{error.format_message().rstrip('.')}; see `elpd --help`", as_json=as_json)
+        context = error.ctx if isinstance(error, click.UsageError) else None
+        verb = context.command_path.rpartition("elpd")[2] if context is not None else ""
+        report_error("UsageError", f"{error.format_message().rstrip('.')}; see `elpd{verb} --help`", as_json=as_json)
         sys.exit(2)
     except ElpdError as error:
         report_error(error.kind, str(error), as_json=as_json)

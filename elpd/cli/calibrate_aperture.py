@@ -32,6 +32,7 @@ MOST_OPENINGS = 50
 @click.option(
     "--lag-us", type=float, metavar="US", help="The photoreceptors' lag at full light; else left in the curve."
 )
+@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw it, as a PNG.")
 @click.option("--dry-run", is_flag=True, help="Measure, but leave the stored profile as it is.")
 @config_options
 @json_option
@@ -43,6 +44,7 @@ def command(
     threshold: str | None,
     refractory_us: float | None,
     lag_us: float | None,
+    plot: Path | None,
     dry_run: bool,
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -54,6 +56,8 @@ def command(
     opens once; what it tells is stored for the aperture of the configuration.
     """
     config = load(config_path, overrides)
+    if plot is not None and not plot.resolve().parent.is_dir():
+        raise UsageError(f"--plot {plot}: there is no folder {plot.resolve().parent}; make it first")
     span = parse_interval_us(interval, "--open-us")
     if path is None and span is not None:
         raise UsageError("--open-us is about a recording; give PATH")
@@ -82,8 +86,12 @@ def command(
     on = measured_on(config)
     found = combine(curves, delays, on, threshold=c, lag_corrected=lag_us is not None)
     stored = None if dry_run else save(state_directory(config), found)
+    if plot is not None:
+        from elpd.calibrate.opening_plot import draw_opening  # noqa: PLC0415
+
+        draw_opening(plot, found)
     if as_json:
-        print_json({**found.model_dump(mode="json"), "saved": stored})
+        print_json({**found.model_dump(mode="json"), "saved": stored, "plot": plot})
     else:
         _tell(found)
         if stored is not None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import click
 
 from elpd.cli.common import config_options, json_option, print_json
 from elpd.config import load
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from elpd.errors import UsageError
 
 REACH_DOF = 20.0
 
@@ -21,6 +19,7 @@ REACH_DOF = 20.0
     "--reach-um", type=float, metavar="UM", help="How far to go to either side; by default 20 depths of focus."
 )
 @click.option("--here", is_flag=True, help="The lens stands in focus already; do not focus first.")
+@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw it, as a PNG.")
 @click.option("--dry-run", is_flag=True, help="Measure, but leave the stored profile as it is.")
 @config_options
 @json_option
@@ -28,6 +27,7 @@ def command(
     *,
     reach_um: float | None,
     here: bool,
+    plot: Path | None,
     dry_run: bool,
     config_path: Path | None,
     overrides: tuple[str, ...],
@@ -40,6 +40,8 @@ def command(
     Exit 0 with a profile, 1 if the play could not be measured.
     """
     config = load(config_path, overrides)
+    if plot is not None and not plot.resolve().parent.is_dir():
+        raise UsageError(f"--plot {plot}: there is no folder {plot.resolve().parent}; make it first")
     from elpd import rig  # noqa: PLC0415  (numba and devices only now)
     from elpd.calibrate.backlash import measure_backlash  # noqa: PLC0415
     from elpd.calibrate.in_use import as_measured  # noqa: PLC0415
@@ -73,9 +75,13 @@ def command(
     found = backlash_calibration(measure_backlash(evidence, depth_of_focus_um), on)
     known = found.backlash_um.value is not None
     stored = save(state_directory(config), found) if known and not dry_run else None
+    if plot is not None:
+        from elpd.calibrate.play_plot import draw_play  # noqa: PLC0415
+
+        draw_play(plot, found)
     if as_json:
         approach_um = found.approach_um if known else None
-        print_json({**found.model_dump(mode="json"), "approach_um": approach_um, "saved": stored})
+        print_json({**found.model_dump(mode="json"), "approach_um": approach_um, "saved": stored, "plot": plot})
         return 0 if known else 1
     print(f"{'play':24s} {found.backlash_um}")
     print(f"{'late by':24s} {found.lag_us}")

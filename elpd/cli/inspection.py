@@ -33,7 +33,6 @@ NOTHING_FOUND = {
 }
 """Of our own discoveries: what is not there, and what to do about it. The simulated rig needs neither."""
 
-KERNEL_ROOMS = ("elpd.events", "elpd.vision")
 
 _MCL_CURRENT_ON_FAULT = 1 | 4  # lock what is there, but do not page everything in just to find out
 
@@ -76,11 +75,14 @@ def versions() -> list[Finding]:
 
 def kernels() -> list[Finding]:
     """Import every room with kernels: they compile, or come from the cache, right then."""
+    from elpd.service.compiling import by_others, modules  # noqa: PLC0415  (numba, only for this)
+
     begun = time.perf_counter()
     found: dict[str, Any] = {}
     try:
-        for room in KERNEL_ROOMS:
-            for module in _modules(room):
+        names = modules(files=True)  # and with them, for two processes share the work, what the self-test needs
+        with by_others([*names, *(point.module for point in entry_points(group="elpd.rigs"))]):
+            for module in names:
                 found |= _dispatchers(importlib.import_module(module))
     except Exception as error:  # noqa: BLE001  (numba raises many kinds; each means the same to the person)
         return [
@@ -215,12 +217,6 @@ def focus_simulated() -> dict[str, Any]:
 
 
 # --- parts -------------------------------------------------------------------------------------------------------
-
-
-def _modules(room: str) -> list[str]:
-    package = importlib.import_module(room)
-    folder = Path(str(package.__file__)).parent
-    return [f"{room}.{path.stem}" for path in sorted(folder.glob("*.py")) if path.stem != "__init__"]
 
 
 def _dispatchers(module: Any) -> dict[str, Any]:

@@ -39,19 +39,20 @@ def command(*, config_path: Path | None, overrides: tuple[str, ...], as_json: bo
     config = _paced(load(config_path, overrides))
     _remember_for_parking(config_path)
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # before there are threads: they all inherit it
-    from elpd.service.api import ApiServer  # noqa: PLC0415  (numba and pydantic only now)
-    from elpd.service.engine import RigEngine  # noqa: PLC0415
-    from elpd.service.job import Place  # noqa: PLC0415
-    from elpd.service.listening import handed_over  # noqa: PLC0415
-    from elpd.service.notify import Notifier  # noqa: PLC0415
-    from elpd.service.threads import API_LIMIT_S, API_LOOP, EngineThreads  # noqa: PLC0415
-    from elpd.service.timing import RealTime  # noqa: PLC0415
+    from elpd.service.notify import Notifier  # noqa: PLC0415  (numba and pydantic only now)
     from elpd.service.warm import settle, warm_up  # noqa: PLC0415
 
     notifier = Notifier()
-    sockets = handed_over(os.environ, os.getpid())
     notifier.tell(status="compiling kernels")
-    warm_up()
+    warm_up(config)  # before the rooms that need them are imported, which would compile them
+    from elpd.service.api import ApiServer  # noqa: PLC0415
+    from elpd.service.engine import RigEngine  # noqa: PLC0415
+    from elpd.service.job import Place  # noqa: PLC0415
+    from elpd.service.listening import handed_over  # noqa: PLC0415
+    from elpd.service.threads import API_LIMIT_S, API_LOOP, EngineThreads  # noqa: PLC0415
+    from elpd.service.timing import RealTime  # noqa: PLC0415
+
+    sockets = handed_over(os.environ, os.getpid())
     place = Place()
     engine = RigEngine(config, RealTime(place.wait), place, threaded=True)
     api = ApiServer(engine, config.api, sockets)

@@ -7,7 +7,9 @@ them, in bounded memory.
 
 from __future__ import annotations
 
+import stat
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
@@ -22,7 +24,6 @@ from elpd.records import Encoding, Geometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -54,6 +55,9 @@ class EventChunk(NamedTuple):
     imu: tuple[ImuSample, ...] = ()
 
 
+_WANTED = "an event file is read forth and back; write the stream to a file first, such as `cat >recording.raw`"
+
+
 def installed_formats() -> dict[str, RecordingFormat]:
     """Load every format of the entry-point group, by its entry point's name."""
     return {entry.name: cast("RecordingFormat", entry.load()) for entry in entry_points(group=FORMATS_GROUP)}
@@ -67,16 +71,25 @@ def open_recording(path: Path) -> RecordingReader:
     FormatError
         If there is no such file, or no installed format can read it.
     """
-    if path.is_dir():
-        raise FormatError(f"{path} is a directory, not an event file")
     try:
-        size = path.stat().st_size
+        found = path.stat()
+        if stat.S_ISDIR(found.st_mode):
+            raise FormatError(f"{path} is a directory, not an event file")
+        if not stat.S_ISREG(found.st_mode):
+            raise FormatError(f"{path} is a pipe or a device, and {_WANTED}")
         with path.open("rb") as file:
             beginning = file.read(16)
+    except FileNotFoundError as error:
+        if path == Path("-"):
+            raise FormatError(f"standard input is not read: {_WANTED}") from error
+        raise FormatError(f"{path} cannot be read: {error.strerror}; check its name and folder") from error
+    except PermissionError as error:
+        raise FormatError(f"{path} cannot be read: {error.strerror}; `ls -l` tells who may") from error
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {error.strerror}") from error
+    size = found.st_size
     if size == 0:
-        raise FormatError(f"{path} is empty: 0 bytes")
+        raise FormatError(f"{path} is empty: 0 bytes; nothing was recorded, or nothing was copied")
     formats = installed_formats()
     for candidate in formats.values():
         if candidate.recognises(path):

@@ -1,6 +1,6 @@
 """What is made of a sweep once its stop has been sent: where focus was, and what further passes over it add.
 
-The witnesses of ``vision.crossing`` are asked after the stop, of the events that the sweep has left, and again after
+The witnesses of ``vision.witness`` are asked after the stop, of the events that the sweep has left, and again after
 every further pass. The events of the way back are counted: reports alone prove no motion.
 """
 
@@ -13,8 +13,9 @@ from elpd.focus.course import Course
 from elpd.focus.frame_track import FrameTrack
 from elpd.focus.passes import NO_PLAY, Pass, Passes, Play
 from elpd.units import SensorUs
-from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
 from elpd.vision.sharpest import sharpest
+from elpd.vision.slowness import DARK, DARK_OF_MAP
+from elpd.vision.witness import WIDTHS_PER_DEPTH_OF_FOCUS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,7 +72,6 @@ class Aftermath:
         self._settings = settings
         self._locate = locate
         self._course = sweep
-        self._outward = sweep  # the last in the sweep's direction
         self._turned_us = FOR_EVER
         self._passes = Passes()
         self._unheard: list[CameraPacket] = []
@@ -131,7 +131,7 @@ class Aftermath:
             self._unheard.append(replace(packet, data=packet.data.copy(), frames=()))
         for sample in hearing.windows(packet):
             if sample.end_us <= self._turned_us:
-                self._outward.samples.append(sample)
+                self._course.samples.append(sample)
             self.events_back += sample.n_on + sample.n_off if sample.begin_us >= self.back_from_us else 0
 
     def go_back(self, at_us: SensorUs) -> None:
@@ -139,9 +139,9 @@ class Aftermath:
         self.back_from_us, self.events_back = at_us, 0
 
     def events_within(self, from_um: float, to_um: float) -> int:
-        """Return how many events the last pass in the sweep's direction saw between two places."""
+        """Return how many events the last pass saw between two places."""
         low, high = min(from_um, to_um), max(from_um, to_um)
-        return sum(one.n_on + one.n_off for one in self._outward.samples if low <= one.position_um <= high)
+        return sum(one.n_on + one.n_off for one in self._course.samples if low <= one.position_um <= high)
 
     def return_score(self, focus_um: float) -> float | None:
         """Return by how many standard deviations the way back undid what the way out from focus had done to the pixels.
@@ -201,6 +201,11 @@ class Aftermath:
         self._passes.add(said, course.leg.sign, (course.decided_us - look_back_us, course.decided_us))
         return self._passes.estimate(settings.play)
 
+    @property
+    def lag_um(self) -> tuple[float, float]:
+        """How well the first pass knows its lag, and focus but for what makes events late, um."""
+        return self._passes.lag_um()
+
     def take_for_moving(self) -> None:
         """Take the scene for one that moves: of what has been said of it as still only what holds then is believed."""
         self._passes.take_for_moving()
@@ -229,7 +234,6 @@ class Aftermath:
         leg = replace(self._course.leg, sign=sign, begun_us=at_us, judge_from_um=sign * from_um)
         frames = FrameTrack(self._hearing.roi, follow=self.scene_moves)
         self._course = Course(leg, self._hearing.memory, frames, self._course.heading)
-        self._outward = self._course if sign == self._passes.sign else self._outward
         self._turned_us = FOR_EVER
 
     def pass_again(self, packet: CameraPacket) -> None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elpd.units import SensorUs
-from elpd.vision.crossing import frame_witness, fuse, lamp_witness
 from elpd.vision.drift import find_drift
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
+from elpd.vision.witness import frame_witness, fuse, lamp_witness
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import FocusEstimate
-    from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
+    from elpd.vision.witness import EventWitnesses, Witness
 
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
@@ -85,7 +85,7 @@ class Pass:
         """Ask the events and frames of this pass.
 
         *unexplained* is the share of the lag that may be wrong, *dark* the dark current that *brightness* does not
-        show (both as in ``vision.crossing``).
+        show (as in ``vision.witness`` and ``vision.slowness``).
         Where the scene moves, its turns make mirrors: pairs, and what they tell of depths and lag, are not asked.
         """
         memory = self.memory
@@ -120,10 +120,8 @@ class Pass:
         strayed_um = tilt * said.image.finest.width**2 / self.width_um
         return [
             replace(
-                one,
-                at=one.at + said.lag.at - lag.at,
+                one.with_lag(lag.at, float(np.hypot(lag.sigma, undated_um))),
                 sigma=float(np.hypot(one.sigma, strayed_um)),
-                shared=float(np.hypot(lag.sigma, undated_um)),
             )
             for one in said.witnesses(width=self.width_um)
             if one.name == "vertex"
@@ -210,15 +208,36 @@ class Passes:
         """Say whether any of the times was near focus."""
         return any(begin <= when <= end for begin, end in self._near_us for when in times_us)
 
+    def lag_um(self) -> tuple[float, float]:
+        """Return how well the first pass knows its lag, and focus but for what makes events late: standard errors, um.
+
+        The worst and the best of its witnesses. Without any: nothing, infinity.
+        """
+        said = self._said[0][0].witnesses if self._said else ()
+        late = [one for one in said if one.shared > 0.0]
+        return max((one.shared for one in late), default=0.0), min((one.sigma for one in late), default=inf)
+
+    def _of_one_lag(self) -> list[tuple[Witness, int]]:
+        """Return all witnesses, each with the direction of its pass.
+
+        Where there is more than one pass, those of one kind have the same lag taken off, their mean: what is common to
+        passes there and back cancels, and what each measured of the lag by itself would not.
+        """
+        said = [(one, sign) for testimony, sign in self._said for one in testimony.witnesses]
+        if len(self._said) < 2:
+            return said
+        evened = []
+        for one, sign in said:
+            alike = [other for other, _ in said if other.name == one.name]
+            freed, shared = (float(np.mean([getattr(other, key) for other in alike])) for key in ("freed", "shared"))
+            evened.append((one.with_lag(freed, shared), sign))
+        return evened
+
     def estimate(self, play: Play) -> FocusEstimate | None:
         """Return where focus is, on the motor's ruler, while the carriage is pushed in the sweep's direction."""
         sweep = self.sign
         found = fuse(
-            [
-                one if sign == sweep else one.on_the_way_back(play.um, play.sigma_um)
-                for said, sign in self._said
-                for one in said.witnesses
-            ]
+            [one if sign == sweep else one.on_the_way_back(play.um, play.sigma_um) for one, sign in self._of_one_lag()]
         )
         if found is None:
             return None

@@ -1,10 +1,13 @@
-"""More passes over focus, there and back, where the scene moves and one is not to be believed.
+"""More passes over focus, there and back, where one is not to be believed: the scene moves, or the light is dim.
 
 Whatever answers late (photoreceptors, pixels that hold back less than a threshold, motion that dithers them) is late by
 as much on the way back as on the way there, at the same speed: the mean of the two knows focus, and what is left is the
 play between motor and carriage and what the motion did by chance. The chance is another one in each pass, so passes are
 made until the answer is good enough or there have been enough of them. They are as fast as the sweep, because a scene
 strays with time: a slow pass sees more of its motion.
+
+In a still scene it is dim light that asks for another pass. Photoreceptors are late there by more than an answer may be
+off, and what one pass tells of that hangs on which pixels are how dark. One way back does, at the sweep's speed.
 """
 
 from __future__ import annotations
@@ -43,12 +46,15 @@ LOOKS_FOR_MOTION = 1
 """Rounds that are spent on seeing whether a scene moves that was taken for still: hands tremble at 5 Hz and faster, and
 two passes and a round last long enough for one to be seen on its way."""
 
+SIGMAS = 3.0
+"""So many standard errors may a lag lie from what was taken off for it; a depth of focus has to hold them."""
+
 ROUNDS_LEFT = 2.0
 """How many more rounds there must be time for, so that one is begun: the way to focus takes less than one."""
 
 
 def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
-    """Say whether one pass is not enough: the scene has been seen to move, or the answer is doubtful.
+    """Say whether one pass is not enough: the scene has been seen to move, the light is dim, or the answer is doubtful.
 
     Where motion was suspected at rest and the answer is doubtful, the scene is taken for one that moves after all.
     Where events were lost near focus, a lamp flickers or several depths were told, other passes would not help.
@@ -58,7 +64,14 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
     doubtful = (first is None or first.sigma_um > judging.limit_um(settings)) and not watch.after.depths_um
     if not watch.scene_moves and doubtful and watch.motion_suspected:
         watch.after.take_for_moving()
-    return watch.scene_moves or doubtful
+    return watch.scene_moves or doubtful or _is_dim(watch, settings)
+
+
+def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
+    """Say whether the lag alone may put a still scene's answer out of focus, and nothing else is in the way of one."""
+    lag_um, but_for_it_um = watch.after.lag_um
+    clear = but_for_it_um <= judging.limit_um(settings) and not watch.after.depths_um
+    return clear and SIGMAS * lag_um > settings.depth_of_focus_um
 
 
 def pass_again(
@@ -72,14 +85,14 @@ def pass_again(
     """Go over focus again until it is known or there is no more time: back, and then there and back.
 
     Returns what all passes say and the furthest place, um, in the sweep's direction. In a still scene a doubtful answer
-    may come of several depths as well as of the lag; more passes would only make their mixture look certain. So they
-    are believed only if one of them has seen the scene move, which a hand that turned round in the first did not show;
-    else the answer is refused as it is.
+    may come of several depths; more passes would only make their mixture look certain. So they are believed only if it
+    is the lag alone that is in doubt, or if one of them has seen the scene move, which a hand that turned round in the
+    first did not show; else the answer is refused as it is.
 
     The way is bounded: a few times the reach, the ramps and the play; its time is the caller's phase ``recross``. The
     lens is left on the side that the sweep came from.
     """
-    estimate = first
+    estimate, dim = first, _is_dim(watch, settings)
     certain_um = min(settings.depth_of_focus_um / CERTAIN_SIGMAS, judging.limit_um(settings))
     furthest_um = stage.here_um()
     for looks, ways in enumerate([(-sign,), *MOST_ROUNDS * [(sign, -sign)]]):
@@ -93,14 +106,11 @@ def pass_again(
             furthest_um = sign * max(sign * furthest_um, sign * stage.here_um())
             estimate = watch.after.estimate()
         took_ns = stage.now_ns() - begun_ns
-        if not watch.scene_moves:
-            estimate = first
-            if looks == LOOKS_FOR_MOTION:
-                break
-            continue
-        if estimate is not None and estimate.sigma_um <= certain_um:
-            break
-        if stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
+        if watch.scene_moves or dim:
+            enough = estimate is not None and estimate.sigma_um <= certain_um
+        else:
+            estimate, enough = first, looks == LOOKS_FOR_MOTION
+        if enough or stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
             break
     return estimate, furthest_um
 

@@ -129,10 +129,10 @@ class Errands:
 
     def jog(self, by_um: float, speed_um_s: float) -> Arrival:
         """Go so much further than here; what leads beyond a limit is refused as a whole."""
-        here_um = self._here_um()
-        if here_um is None:
+        report, _ = self._rest(REST_MS)
+        if LensFlag.REFERENCED not in report.flags:
             raise LensError("lens: cannot jog by um, its position is unknown; home it first")
-        return self.move_to(here_um + by_um, speed_um_s)
+        return self.move_to(self._scale.to_um(report.steps) + by_um, speed_um_s)
 
     def stop(self) -> Arrival:
         """Stop now, as hard as the controller can, and say where that was. Idempotent."""

@@ -45,8 +45,8 @@ def format_for(path: Path, word: str | None) -> tuple[WritableFormat, str]:
         if word is None:
             suffixes = ", ".join(dict.fromkeys(suffix for _, suffix in known.values())) or "none"
             raise UsageError(
-                f"{path.name}: no format is usually called {path.suffix or 'so, without a suffix'!r}; "
-                f"known are {suffixes}; or say which with --format"
+                f"{path.name}: {f'no format has the suffix {path.suffix!r}' if path.suffix else 'there is no suffix'}; "
+                f"known are {suffixes}; or say which format with --format"
             )
     if word not in known:
         raise UsageError(f"--format {word!r} cannot be written; known are {', '.join(known)}")

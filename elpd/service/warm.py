@@ -10,13 +10,15 @@ import gc
 import importlib
 import sys
 import time
-from pathlib import Path
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import structlog
 
-from elpd.service import memory
+from elpd.service import compiling, memory
 
-KERNEL_ROOMS = ("elpd.events", "elpd.vision", "elpd.focus")
+if TYPE_CHECKING:
+    from elpd.config import Config
 
 SWITCH_INTERVAL_S = 5e-5
 """How long another thread may keep the interpreter before the focus thread gets it: 5 ms unless set."""
@@ -24,14 +26,17 @@ SWITCH_INTERVAL_S = 5e-5
 log = structlog.get_logger(__name__)
 
 
-def warm_up() -> None:
-    """Compile every kernel, and leave what exists by then out of the garbage collector's rounds."""
+def warm_up(config: Config | None = None) -> None:
+    """Have every kernel that the daemon and its rig need, and let go of what made them.
+
+    Raises ``SystemExit`` if the process was asked to end meanwhile.
+    """
     begun_s = time.perf_counter()
-    for room in KERNEL_ROOMS:
-        folder = Path(str(importlib.import_module(room).__file__)).parent
-        for path in sorted(folder.glob("*.py")):
-            if path.stem != "__init__":
-                importlib.import_module(f"{room}.{path.stem}")
+    names = compiling.modules(config)
+    with compiling.by_others(names):
+        for name in names:
+            with suppress(ImportError):  # a driver whose library is not here is told of when it is opened
+                importlib.import_module(name)
     memory.drop_compiler()
     log.info("kernels ready", seconds=round(time.perf_counter() - begun_s, 3))
 

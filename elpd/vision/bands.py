@@ -84,6 +84,8 @@ class BandFocus:
     """Where focus is, with its error; the finest band's vertex; how far it departs from focus.
 
     ``scatter`` is how far the points of the two finest bands lie off their parabolas, as an error of the vertex.
+    ``as_blur`` says that the finest band rose higher than the next and has the narrower top: blur takes fine structure
+    first. The difference of two pictures that lie aside comes and goes in all bands alike, or in coarse ones first.
     """
 
     at: float
@@ -91,11 +93,12 @@ class BandFocus:
     finest: Vertex
     departure: float
     scatter: float
+    as_blur: bool = True
 
     def mirrored(self, sign: float) -> BandFocus:
         """Return the same on a ruler that runs the other way, where *sign* is -1."""
         finest = replace(self.finest, at=sign * self.finest.at)
-        return BandFocus(sign * self.at, self.sigma, finest, sign * self.departure, self.scatter)
+        return replace(self, at=sign * self.at, finest=finest, departure=sign * self.departure)
 
 
 def focus_of_bands(
@@ -110,6 +113,8 @@ def focus_of_bands(
     if raw[0] is None or finest is None:
         return None
     scatter = float(np.hypot(raw[0].sigma, raw[0].sigma if raw[1] is None else raw[1].sigma))
+    rise = log_energies[int(np.argmax(log_energies[:, 0]))] - log_energies[0]
+    as_blur = bool(rise[1] < rise[0]) and (raw[1] is None or raw[1].width > raw[0].width)
     bound = DEPARTURE * finest.width
     normal, right, squares, count = np.diag([0.0, 1.0 / bound**2]), np.zeros(2), 0.0, 0
     for band, f_squared in enumerate(_FREQUENCIES[:bands]):
@@ -135,7 +140,7 @@ def focus_of_bands(
     inverse = np.linalg.inv(normal)
     focus, departure = (float(one) for one in inverse @ right)
     own = float(np.sqrt(inverse[0, 0] * max(1.0, squares / count)))
-    return BandFocus(focus, float(np.hypot(own, UNEXPLAINED * departure)), finest, departure, scatter)
+    return BandFocus(focus, float(np.hypot(own, UNEXPLAINED * departure)), finest, departure, scatter, as_blur)
 
 
 def average_focus(candidates: Sequence[BandFocus]) -> BandFocus:

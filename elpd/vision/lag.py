@@ -10,7 +10,7 @@ measurement is log-normal.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log, sqrt
+from math import exp, expm1, log, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,13 +31,13 @@ DECADES = 0.5
 
 TYPICAL_SLOWNESS, SPREAD = 4.8, 3.4
 """How many times slower than the brightest a pixel is, mean and standard deviation, where no picture tells: evenly
-spread over the powers of ten between one and what dark current leaves of the light (``crossing.DARK``)."""
+spread over the powers of ten between one and what dark current leaves of the light (``slowness.DARK``)."""
 
 OTHER_LIGHT = 0.5
 """How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
 
 _FAR, _CELLS = 6.0, 401
-"""How many standard deviations the distribution of a lag is drawn to, and how finely."""
+"""How many standard errors the distribution of a measured lag is drawn to, and how finely."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +83,27 @@ class LagPrior:
 def expected_lag(line: Line | None, median: float) -> Lag:
     """Return the mean and standard deviation of what is known after a measurement.
 
-    Before it, the lag has the log-normal distribution of that *median* and of ``DECADES``; the measurement's error is
-    normal. The mean of an unmeasured lag is twice its median, its standard deviation three times.
+    Before it, the lag has the log-normal distribution of that *median* and of ``DECADES``: a mean of twice its median,
+    a standard deviation of three times. Its peak is at a quarter of the median, which is an opinion about how bright
+    rooms are; a measurement that is better than the expectation is not drawn there but asks only how long the tail is
+    (an exponential distribution of the same standard deviation), and what that moves it by is in the error. A
+    measurement that is worse adds nothing.
     """
     if median <= 0.0:
         return Lag()
-    lag = median * np.exp(DECADES * log(10.0) * np.linspace(-_FAR, _FAR, _CELLS))
-    if line is not None:
-        near = line.slope + line.sigma * np.linspace(-_FAR, _FAR, _CELLS)
-        lag = np.union1d(lag, near[near > 0.0])
-    logarithm = -0.5 * np.square(np.log(lag / median) / (DECADES * log(10.0))) - np.log(lag)
-    if line is not None:
-        logarithm -= 0.5 * np.square((lag - line.slope) / line.sigma)
-    share = np.exp(logarithm - logarithm.max()) * np.gradient(lag)
+    width = DECADES * log(10.0)
+    mean = median * exp(0.5 * width**2)
+    usual = Lag(mean, mean * sqrt(expm1(width**2)))
+    if line is None or line.sigma >= usual.sigma:
+        return usual
+    tilted = line.slope - line.sigma**2 / usual.sigma
+    lag = np.linspace(max(0.0, tilted - _FAR * line.sigma), max(tilted, 0.0) + _FAR * line.sigma, _CELLS)
+    logarithm = -0.5 * np.square((lag - tilted) / line.sigma)
+    share = np.exp(logarithm - logarithm.max())
     share /= share.sum()
     at = float(share @ lag)
-    return Lag(at, sqrt(float(share @ np.square(lag - at))))
+    own = sqrt(float(share @ np.square(lag - at)))
+    return Lag(at, float(np.hypot(own, min(abs(at - max(line.slope, 0.0)), line.sigma))))
 
 
 def weights_of_lines(lines: Sequence[Line | None]) -> NDArray[np.float64]:

@@ -9,11 +9,12 @@ picture, and the vertex does not depend on the start picture.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import DARK, LEAST_LEVEL, ROI_MARGIN_PX, ask_events
+from elpd.vision.crossing import LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain, stamp_events
@@ -21,6 +22,7 @@ from elpd.vision.lag import UNMEASURED_LAG_US, LagPrior
 from elpd.vision.planes import FLANK
 from elpd.vision.rebuilt import EventStretch
 from elpd.vision.refractory import Refractory, refractory_period
+from elpd.vision.slowness import DARK
 from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -29,9 +31,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, SensorProfile
-    from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
+    from elpd.vision.integral import Vertex
     from elpd.vision.ruler import Ruler
+    from elpd.vision.witness import EventWitnesses, Witness
 
 MIN_EVENTS = 1_000
 """Fewer events between the flank of the peak and now make no image worth a vertex."""
@@ -322,7 +325,8 @@ class EventMemory:
     ) -> tuple[list[Witness], float | None]:
         """Return what the events of a record say, on the ruler, and the width of the curve (``None`` if nothing)."""
         deaf = self.refractory()
-        if self.flicker() is not None:
+        lamp = self.flicker()
+        if lamp is not None:
             # What makes pairs of bright pixels differ from those of dark ones is the lamp then, not the lag.
             brightness = start = None
         said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
@@ -330,14 +334,45 @@ class EventMemory:
         if said is None or (said.image is None and not said.depths):
             return [], None
         _, _, sign = ruler.stretch(now_us)
+        if lamp is not None:
+            said = self._dithered(said, lamp, now_us, ruler)
         undated = deaf.sigma_us * ruler.speed_at(now_us)
         self.depths = tuple(sign * at for at in said.depths)
         width = said.plane_width if said.image is None else said.image.finest.width
         witnesses = [
             replace(one, at=sign * one.at, shared=float(np.hypot(one.shared, undated)))
             for one in said.witnesses(width=width)
+            if lamp is None or said.depths or one.name != "pairs"
         ]
         return witnesses, width
+
+    def _dithered(self, said: EventWitnesses, lamp: Flicker, now_us: int, ruler: Ruler) -> EventWitnesses:
+        """Return what the events say, for a lamp that swings the levels to and fro between the thresholds.
+
+        A pixel that has turned need not come back by a whole threshold then: the lamp carries it there. So turns that
+        are put back by one, as in the rebuilt image, come too early, and turns as they are, in the levels at the end of
+        each of the lamp's periods, too late; where between the two depends on the lamp's swing over the thresholds.
+        Pairs are as early and are not asked.
+        """
+        raw = self._by_periods(lamp, now_us, ruler)
+        if said.image is None or raw is None:
+            return said
+        _, _, sign = ruler.stretch(now_us)
+        early, late = said.image.at, sign * raw.at - said.lag.at
+        between = float(np.hypot(said.image.sigma, (late - early) / sqrt(12.0)))
+        return replace(said, image=replace(said.image, at=0.5 * (early + late), sigma=between))
+
+    def _by_periods(self, lamp: Flicker, now_us: int, ruler: Ruler) -> Vertex | None:
+        """Return the vertex of log S of the image at the end of each of a lamp's periods, dated to their middle."""
+        t_us, x, y, on = (column[: self._taken] for column in self._columns)
+        ends_us = np.arange(float(now_us), float(t_us[0]), -lamp.period_us)[::-1]
+        energy = EventEnergy(*self._shape, ROI_MARGIN_PX, None if self._start is None else self._start.levels)
+        track, done = PeakTrack(), 0
+        for end_us, until in zip(ends_us, np.searchsorted(t_us, ends_us), strict=True):
+            energy.add(x[done:until], y[done:until], on[done:until])
+            done = until
+            track.add(round(end_us), ruler.position(round(end_us - 0.5 * lamp.period_us)), energy.measure())
+        return track.vertex()
 
 
 def _columns(capacity: int) -> tuple[NDArray[Any], ...]:

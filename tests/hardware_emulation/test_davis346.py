@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from elpd_drivers.cameras import neuromorphic
-from hardware_emulation import usbfs
+from hardware_emulation import plugged
 from hardware_emulation.davis346 import ADC_MHZ, EXPOSURE, FRAME_INTERVAL, MASKED_COLUMNS, MASKED_ROWS, RUN, Davis346
 from hardware_emulation.davis346 import ON_THRESHOLD as ON_BIAS
 from hardware_emulation.davis_words import ON, ROW, Encoder, Sample, frame_blocks
+from hardware_emulation.plugged import PATIENCE_S, PATIENT, Plugged, on_a_bus
 from shared import RECORDINGS, needs_shared
 
 from elpd.errors import CameraError
@@ -26,18 +27,14 @@ from elpd.timebase import MonotonicClock
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from elpd_drivers.cameras.capture import CapturedCamera
+    from hardware_emulation import usbfs
     from numpy.typing import NDArray
 
     from elpd.records import CameraPacket, Frame, ImuSample, Trigger
 
 pytest.importorskip("neuromorphic_drivers")
-pytestmark = [
-    pytest.mark.xdist_group("usb"),
-    pytest.mark.skipif(usbfs.missing() is not None, reason=str(usbfs.missing())),
-]
+pytestmark = plugged.marks
 
-PATIENCE_S = 120.0
 WIDTH, HEIGHT = 346, 260
 WORDS_OF_A_BUFFER = 1 << 16
 G_M_S2, RAD_S = 4 * 9.80665 / 32768, np.radians(500.0) / 32768
@@ -47,9 +44,7 @@ SETTINGS: dict[str, Any] = {
     "serial": "00000499",
     "model": "davis346",
     "usb_packets": 256,
-    "max_delay_ms": 0,
-    "open_timeout_s": PATIENCE_S,
-    "hang_ms": 1e3 * PATIENCE_S,
+    **PATIENT,
     "exposure_us": 700,
     "frame_interval_us": 20_000,
     "biases": {"expose": {"onbn": 1500}, "focus": {"onbn": 1600}},
@@ -80,14 +75,13 @@ class Heard:
         self.columns = [np.concatenate(column).tolist() for column in zip(*columns, strict=True)]
 
 
-class Rig:
+class Rig(Plugged):
     """An emulated DAVIS346, plugged in and open; its clock goes on from test to test."""
 
     def __init__(self, bus: usbfs.Bus) -> None:
-        self.bus, self.davis = bus, Davis346()
+        self.davis = Davis346()
         self.now_us, self.words, self.lost = 0, Encoder(), False
-        bus.plug(self.davis)
-        self.camera: CapturedCamera = neuromorphic.open_camera(SETTINGS, MonotonicClock())
+        super().__init__(bus, self.davis, SETTINGS)
 
     def later(self) -> int:
         """Return a time of the sensor's clock after all before."""
@@ -103,14 +97,7 @@ class Rig:
 
     def packets(self, last_us: int) -> Iterator[CameraPacket]:
         """Yield what is delivered until the camera has spoken of *last_us*."""
-        until = time.monotonic() + PATIENCE_S
-        while time.monotonic() < until:
-            packet = self.camera.read(0.02)
-            if packet is not None:
-                yield packet
-                if packet.complete_until_us is not None and packet.complete_until_us >= last_us:
-                    return
-        raise AssertionError(f"{last_us} us did not come within {PATIENCE_S:g} s")
+        return self.read_until(lambda packet: (packet.complete_until_us or -1) >= last_us, f"{last_us} us")
 
     def hear(self, *kinds: Any) -> Heard:
         """Let the camera say what was encoded, and that time went on; return what is delivered."""
@@ -124,22 +111,11 @@ class Rig:
             at += size
         return Heard(self.packets(end_us))
 
-    def wait_for(self, condition: Callable[[], bool]) -> None:
-        """Read on until *condition* holds."""
-        until = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < until, f"not within {PATIENCE_S:g} s"
-            self.camera.read(0.005)
-
 
 @pytest.fixture(scope="module")
 def rig() -> Iterator[Rig]:
-    with usbfs.Bus() as bus, pytest.MonkeyPatch.context() as patch:
-        for name, value in bus.environment.items():
-            patch.setenv(name, value)
-        made = Rig(bus)
+    with on_a_bus(Rig) as made:
         yield made
-        made.camera.close()
 
 
 @pytest.fixture
@@ -326,10 +302,7 @@ def test_unplugged_and_plugged_in_again(started: Rig) -> None:
         camera.start()
     started.davis = Davis346(aps_orientation=0b101)
     started.bus.plug(started.davis)
-    until = time.monotonic() + PATIENCE_S
-    while not camera.reopen() and time.monotonic() < until:
-        time.sleep(0.01)
-    camera.start()
+    started.reopen()
     started.now_us, started.words = 0, Encoder()
     started.words.frame((1000, 2000, 2700, 9000), picture(2), orientation=0b101)
     (frame,) = started.hear("frames").frames

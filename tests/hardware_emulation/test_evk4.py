@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from elpd_drivers.cameras import neuromorphic
 from elpd_drivers.cameras.words import STEP_BACK_US
-from hardware_emulation import usbfs
+from hardware_emulation import plugged
 from hardware_emulation.evk4 import BIAS_DIFF_ON, DIGITAL_MASK, RATE_ENABLE, RATE_EVENTS, ROI_X, ROI_Y, Evk4
+from hardware_emulation.plugged import PATIENCE_S, PATIENT, Plugged, on_a_bus
 from shared import RECORDINGS, needs_shared
 
 from elpd.errors import CameraError, ConfigError, UsageError
@@ -22,42 +23,34 @@ from elpd.records import BiasSet, Encoding, Geometry, Roi
 from elpd.timebase import MonotonicClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    from elpd_drivers.cameras.capture import CapturedCamera
+    from hardware_emulation import usbfs
     from numpy.typing import NDArray
 
     from elpd.records import CameraPacket
 
 pytest.importorskip("neuromorphic_drivers")
-pytestmark = [
-    pytest.mark.xdist_group("usb"),
-    pytest.mark.skipif(usbfs.missing() is not None, reason=str(usbfs.missing())),
-]
+pytestmark = plugged.marks
 
-PATIENCE_S = 120.0
 AFTER_THE_RECORDING_US = 22_000_000
 TURN_US = 1 << 24
 WIDTH, HEIGHT = 1280, 720
 SETTINGS = {
     "serial": "00050567",
     "usb_packets": 48,
-    "max_delay_ms": 0,
-    "open_timeout_s": PATIENCE_S,
-    "hang_ms": 1e3 * PATIENCE_S,
+    **PATIENT,
     "rate_limit_mev_s": 20.0,
     "biases": {"expose": {"diff_on": 7}, "focus": {"diff_on": 3}},
 }
 
 
-class Rig:
+class Rig(Plugged):
     """An emulated EVK4, plugged in and open."""
 
     def __init__(self, bus: usbfs.Bus) -> None:
-        self.bus, self.evk4 = bus, Evk4()
-        self.now_us = AFTER_THE_RECORDING_US
-        bus.plug(self.evk4)
-        self.camera: CapturedCamera = neuromorphic.open_camera(SETTINGS, MonotonicClock())
+        self.evk4, self.now_us = Evk4(), AFTER_THE_RECORDING_US
+        super().__init__(bus, self.evk4, SETTINGS)
 
     def later(self) -> int:
         """Return a time of the sensor's clock after all before: tests may run in any order."""
@@ -66,16 +59,12 @@ class Rig:
 
     def packets(self, last_us: int) -> Iterator[CameraPacket]:
         """Yield what is delivered until the events of *last_us* have come."""
-        until = time.monotonic() + PATIENCE_S
-        while time.monotonic() < until:
-            packet = self.camera.read(0.02)
-            if packet is None:
-                continue
-            yield packet
+
+        def over(packet: CameraPacket) -> bool:
             until_us = packet.complete_until_us
-            if until_us is not None and (until_us + STEP_BACK_US - last_us) % TURN_US < TURN_US // 2:
-                return
-        raise AssertionError(f"{last_us} us did not come within {PATIENCE_S:g} s")
+            return until_us is not None and (until_us + STEP_BACK_US - last_us) % TURN_US < TURN_US // 2
+
+        return self.read_until(over, f"{last_us} us")
 
     def streamed(self, pieces: Iterator[bytes]) -> Iterator[CameraPacket]:
         """Send piece after piece, each when the one before has arrived, and yield what comes."""
@@ -90,23 +79,12 @@ class Rig:
                     on_its_way -= packet.data.nbytes
                     yield packet
 
-    def wait_for(self, condition: Callable[[], bool]) -> None:
-        """Read on until *condition* holds."""
-        until = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < until, f"not within {PATIENCE_S:g} s"
-            self.camera.read(0.005)
-
 
 @pytest.fixture(scope="module")
 def rig() -> Iterator[Rig]:
     """Open the emulated camera once: its driver sleeps through 2.5 s of that."""
-    with usbfs.Bus() as bus, pytest.MonkeyPatch.context() as patch:
-        for name, value in bus.environment.items():
-            patch.setenv(name, value)
-        made = Rig(bus)
+    with on_a_bus(Rig) as made:
         yield made
-        made.camera.close()
 
 
 @pytest.fixture
@@ -258,10 +236,7 @@ def test_unplugged_and_plugged_in_again(started: Rig) -> None:
         camera.start()
     started.evk4.registers.clear()
     started.bus.plug(started.evk4)
-    until = time.monotonic() + PATIENCE_S
-    while not camera.reopen() and time.monotonic() < until:
-        time.sleep(0.01)  # the driver sleeps through 2.5 s of opening
-    camera.start()
+    started.reopen()
     at_us = started.later()
     started.evk4.send(words_at(at_us))
     (packet,) = started.packets(at_us)

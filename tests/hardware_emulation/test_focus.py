@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
-from elpd_drivers.cameras import neuromorphic
 from elpd_drivers.cameras.words import STEP_BACK_US
 from elpd_drivers.sim.boards import avr
 from elpd_drivers.sim.camera import LATENCY_US, SimulatedCamera
 from elpd_drivers.sim.controllers import Wanted, controller
 from elpd_drivers.sim.rig import SimSettings, SimulatedTruth
 from engines import Daemon
-from hardware_emulation import usbfs
+from hardware_emulation import plugged, usbfs
 from hardware_emulation.evk4 import BIAS_DIFF_ON, Evk4
 from hardware_emulation.lockstep import PtyPort, UsbCamera
+from hardware_emulation.plugged import PATIENT, Plugged, on_a_bus
 from marks import ADAPTER_NS, CRUISE_SPS, worst_at_speed
 from scenarios import SMALL
 
@@ -27,7 +27,6 @@ from elpd.config import load
 from elpd.focus.settings import FocusRequest
 from elpd.record.session import focus_on
 from elpd.records import Outcome, Roi
-from elpd.timebase import MonotonicClock
 from elpd.units import after_ms
 
 if TYPE_CHECKING:
@@ -38,41 +37,35 @@ if TYPE_CHECKING:
     from elpd.ports import RigParts
 
 pytest.importorskip("neuromorphic_drivers")
-pytestmark = [
-    pytest.mark.xdist_group("usb"),
-    pytest.mark.skipif(usbfs.missing() is not None, reason=str(usbfs.missing())),
-]
+pytestmark = plugged.marks
 
-PATIENCE_S = 120.0
 UNMARKED_STEPS = ADAPTER_NS / 1e9 * CRUISE_SPS
 """What the driver is wrong by at speed when no mark comes."""
 
 REGION = Roi(80, 60, 160, 120)
 CAMERA = {
     "serial": "00050567",
-    "max_delay_ms": 0,
-    "open_timeout_s": PATIENCE_S,
-    "hang_ms": 1e3 * PATIENCE_S,
+    **PATIENT,
     "min_latency_us": LATENCY_US + STEP_BACK_US,
     "biases": {"expose": {"diff_on": 7}, "focus": {"diff_on": 3}},
 }
 
 
-class Usb:
+class Usb(Plugged):
     """An emulated EVK4, plugged in and open, and what was sent through it."""
 
-    def __init__(self, bus: usbfs.Bus, evk4: Evk4) -> None:
-        self.bus, self.evk4 = bus, evk4
-        self.captured = neuromorphic.open_camera(CAMERA, MonotonicClock())
-        self.camera: UsbCamera | None = None
+    def __init__(self, bus: usbfs.Bus) -> None:
+        self.evk4 = Evk4()
+        super().__init__(bus, self.evk4, CAMERA)
+        self.stream: UsbCamera | None = None
         self.line: PtyPort | None = None
 
     def rig(self, config: Config) -> RigParts:
         """Build a simulated rig whose camera this is."""
         parts = rig.build(config)
         assert isinstance(parts.camera, SimulatedCamera)
-        self.camera = UsbCamera(parts.camera, self.evk4, self.captured)
-        return replace(parts, camera=self.camera)
+        self.stream = UsbCamera(parts.camera, self.evk4, self.camera)
+        return replace(parts, camera=self.stream)
 
     def rig_behind_a_pty(self, config: Config) -> RigParts:
         """Build one whose Tic, too, is reached by its driver's own port."""
@@ -87,15 +80,9 @@ class Usb:
 
 
 @pytest.fixture
-def usb(monkeypatch: pytest.MonkeyPatch) -> Iterator[Usb]:
-    with usbfs.Bus() as bus:
-        for name, value in bus.environment.items():
-            monkeypatch.setenv(name, value)
-        evk4 = Evk4()
-        bus.plug(evk4)
-        made = Usb(bus, evk4)
+def usb() -> Iterator[Usb]:
+    with on_a_bus(Usb) as made:
         yield made
-        made.captured.close()
 
 
 def truth_of(parts: RigParts) -> SimulatedTruth:
@@ -117,9 +104,9 @@ def test_the_daemons_engine_focuses_over_usb_and_pty_and_the_run_replays(usb: Us
     assert answer.outcome == "FOCUSED"
     assert abs(daemon.truth.carriage_error_um()) < 3.0
     assert answer.lost == 0
-    assert usb.camera is not None
+    assert usb.stream is not None
     assert usb.line is not None
-    assert usb.camera.sent_bytes > 100_000
+    assert usb.stream.sent_bytes > 100_000
     assert min(usb.line.written, usb.line.read) > 200
     assert usb.evk4.registers[BIAS_DIFF_ON] & 0xFF == 3, "the sweep's biases, after the opening's"
     daemon.end()

@@ -449,6 +449,17 @@ def test_our_driver_homes_grblhal_as_its_settings_allow_and_asks_it_whether_it_i
     assert made.rotor == pytest.approx(1000, abs=2.1)
 
 
+def test_that_grblhal_calls_itself_homed_is_not_believed_after_a_reset_by_who_had_lost_trust() -> None:
+    made = rig("grbl", referenced=False, firmware="grblhal")
+    made.open(trust_position=False).home(made.soon(9000))
+    made.port.write(b"\x18")  # what the driver sends with every fault
+    made.live(100, lambda: None)
+    made.plug_in()
+    assert "H:1,1" in say(made, b"\x87"), "the board still says so"
+    with pytest.raises(LensError, match="home it first"):
+        made.open(trust_position=False).move_to(Steps(1000), 12_800.0)
+
+
 def test_after_a_hard_limit_our_driver_resets_grblhal_before_it_homes() -> None:
     made = open_rig("grbl", firmware="grblhal")
     made.motor.slip(made.clock.now_ns(), 600.0)

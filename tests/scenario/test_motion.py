@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from scenarios import Story, assert_invariants, play
 
@@ -72,16 +73,14 @@ def test_where_one_pass_is_enough_no_second_is_made() -> None:
     assert story.result.details["method"] != "two_crossings"
 
 
-def test_the_second_pass_leads_over_focus_in_the_direction_of_the_sweep() -> None:
+def test_the_second_pass_leads_back_over_focus_far_enough_to_see_it_passed() -> None:
     story = shown("violent", 2)  # of the first the sensor at rest sees no motion
-    begun = next(fields for fields in story.named("phase") if fields["name"] == "recross")
+    assert "recross" in story.phases
     assert story.result is not None
     sign = story.result.details["sweep_sign"]
-    moves = [command for command in story.commands if command.name == "move_to"]
-    assert len(moves) >= 2, begun
     places_um = story.truth.mechanism.motor_steps(story.history_ns()) * story.truth.mechanism.mechanics.um_per_step
     focus_um = story.truth.focus_um(sign)
     assert focus_um is not None
-    ahead = sign * (places_um - focus_um) > 0
-    forth = (~ahead[:-1] & ahead[1:]).sum()
-    assert forth >= 2
+    ahead_um = sign * (places_um - focus_um)
+    over = int(np.argmax(ahead_um > 0.0))
+    assert ahead_um[over:].min() < -2.0 * DEPTH_OF_FOCUS_UM, "a way back that is no pass turns at the play"

@@ -331,7 +331,7 @@ def test_stopping_closes_the_socket_and_nothing_starts_it_again(controller: Cont
 
 
 def test_kernels_are_kept_where_the_rest_is_read_only(controller: Controller) -> None:
-    listed = ("find", "/var/cache/elpd/numba", "-name", "evt2.decode_*.nbi", "-printf", "%u %p\\n")
+    listed = ("find", "/var/cache/elpd/numba", "-name", "evt2.decode_*.nbc", "-printf", "%u %p\\n")
     kept = [line.split()[1] for line in controller.machine(*listed).stdout.splitlines()]
     controller.machine("rm", *kept)  # of older sources too, where the tests have run before
     controller.machine("systemctl", "restart", "elpd")

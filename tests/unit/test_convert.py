@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import closing
 from typing import TYPE_CHECKING
 
@@ -118,17 +119,30 @@ def test_the_size_can_be_given(elpd: Callable[..., Answer], tmp_path: Path) -> N
     assert (answer["width"], answer["height"], answer["warnings"]) == (640, 480, [])
 
 
+@pytest.mark.parametrize("verb", [["decode"], ["convert", "out.raw"]])
+def test_a_pipe_is_refused_at_once_though_nobody_writes_to_it(
+    elpd: Callable[..., Answer], tmp_path: Path, verb: list[str]
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    name, *rest = verb
+    answer = elpd(name, "pipe", *rest, "--json")
+    assert (answer.code, answer.json["error"]["kind"]) == (2, "FormatError")
+    assert "pipe is a pipe or a device" in answer.json["error"]["message"]
+    assert "write the stream to a file first" in answer.json["error"]["message"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
         (["in.raw", "old.raw"], "UsageError", "old.raw exists; give another name, or --force"),
         (["in.raw", "in.raw", "--force"], "UsageError", "same file"),
         (["in.raw", "absent/out.raw"], "UsageError", "there is no folder"),
-        (["in.raw", "."], "UsageError", "no format is usually called"),
+        (["in.raw", "."], "UsageError", "there is no suffix; known are ."),
         (["in.raw", "out.mp3"], "UsageError", "known are ."),
-        (["in.raw", "out"], "UsageError", "without a suffix"),
+        (["in.raw", "out"], "UsageError", "there is no suffix"),
         (["in.raw", "out.raw", "--format", "evt9"], "UsageError", "'evt9' cannot be written; known are "),
-        (["absent.raw", "out.raw"], "FormatError", "No such file"),
+        (["absent.raw", "out.raw"], "FormatError", "No such file or directory; check its name"),
+        (["-", "out.raw"], "FormatError", "standard input is not read"),
         (["old.raw", "out.raw"], "FormatError", "in no format"),
         (["in.raw", "out.raw", "--roi", "60,0,20,20"], "UsageError", "does not fit the sensor of 64x48"),
         (["in.raw", "out.raw", "--from-us", "9", "--to-us", "9"], "UsageError", "must be later"),

@@ -57,6 +57,16 @@ def test_a_jog_is_relative_and_refused_whole_beyond_a_limit(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_jog_from_nobody_knows_where_says_so_however_far_it_leads(kind: str) -> None:
+    rig = open_rig(kind, referenced=False)
+    before = rig.rotor
+    for by_um in (-5.0, 5000.0):
+        with pytest.raises(LensError, match="cannot jog by um, its position is unknown; home it first"):
+            errands(rig).jog(by_um, SPEED_UM_S)
+    assert rig.rotor == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_homing_gives_a_reference_and_its_deadline_is_kept(kind: str) -> None:
     rig = open_rig(kind, referenced=False)
     assert errands(rig).home(10_000.0).referenced

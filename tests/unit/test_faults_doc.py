@@ -1,4 +1,4 @@
-"""The table of misfortunes names tests; each of them is there."""
+"""The tables of misfortunes name tests; each of them is there."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "tools" / "docs" / "faults.md").read_text(encoding="utf-8")
+LENSES = (ROOT / "tools" / "docs" / "lenses.md").read_text(encoding="utf-8")
 NAMED = re.findall(r"`(tests/\S+\.py)::(test_\w+)`", TABLE)
 
 
@@ -17,6 +18,16 @@ def test_every_row_names_tests_that_there_are() -> None:
     assert all("::test_" in row for row in rows)
     there = {path: _tests(ROOT / path) for path, _ in NAMED}
     assert [f"{path}::{name}" for path, name in NAMED if name not in there[path]] == []
+
+
+def test_every_misfortune_of_a_lens_names_tests_that_there_are() -> None:
+    rows = {int(number): row for row in LENSES.splitlines() if (number := row[2:4].strip()).isdigit()}
+    assert sorted(rows) == list(range(1, 15))
+    there = set().union(*(_tests(path) for path in (ROOT / "tests").rglob("test_*.py")))
+    for number, row in rows.items():
+        named = set(re.findall(r"`(test_\w+)`", row))
+        assert named, number
+        assert named <= there, named - there
 
 
 def _tests(path: Path) -> set[str]:

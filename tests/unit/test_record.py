@@ -236,7 +236,7 @@ def test_a_full_tmpfs_is_survived(tmp_path: Path) -> None:
         ("old.raw", None, "exists"),
         ("r.npz", None, "only readable when it is finished"),
         ("r.hdf5", None, "only readable when it is finished"),
-        ("r.mp3", None, "no format is usually called"),
+        ("r.mp3", None, "no format has the suffix '.mp3'"),
         ("absent/r.raw", None, "there is no folder"),
     ],
 )

@@ -6,7 +6,7 @@ import naive_sim
 import numpy as np
 import pytest
 from elpd_drivers.sim.optics import Lamp
-from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
+from elpd_drivers.sim.pixels import fire_noise, scratch, sort_events, step_pixels
 from elpd_drivers.sim.sensor import MISMATCH_STEP, EventSensor
 from elpd_drivers.sim.world import random_stream
 from hypothesis import given, settings
@@ -45,9 +45,11 @@ def test_step_equals_its_slow_twin(seed: int, n: int, refractory_us: int, span_u
     begin_us = 10_000
     fast, slow = _state(seed, n, begin_us), _state(seed, n, begin_us)
     t, pixel, on = np.empty(200_000, np.int64), np.empty(200_000, np.int64), np.empty(200_000, np.uint8)
+    outputs = (t, pixel, on)
     count = step_pixels(
-        *fast.values(), F(0.18), F(0.21), F(MISMATCH_STEP), refractory_us, begin_us, begin_us + span_us, 0, t, pixel, on
-    )
+        *fast.values(), F(0.18), F(0.21), F(MISMATCH_STEP), refractory_us, begin_us, begin_us + span_us, 0, *outputs,
+        *scratch(),
+    )  # fmt: skip
     expected = naive_sim.step_pixels(
         *slow.values(), 0.18, 0.21, MISMATCH_STEP, refractory_us, begin_us, begin_us + span_us
     )
@@ -94,7 +96,7 @@ def test_events_beyond_the_arbiters_capacity_are_counted_not_kept() -> None:
     state["held"][:] = 0
     state["target"][:] = state["reference"] + 30
     few = np.empty(5, np.int64), np.empty(5, np.int64), np.empty(5, np.uint8)
-    count = step_pixels(*state.values(), F(0.2), F(0.2), F(MISMATCH_STEP), 10_000, 0, 500, 0, *few)
+    count = step_pixels(*state.values(), F(0.2), F(0.2), F(MISMATCH_STEP), 10_000, 0, 500, 0, *few, *scratch())
     assert count == 100
 
 

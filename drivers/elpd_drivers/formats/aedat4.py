@@ -241,7 +241,7 @@ class Aedat4Reader:
                 self._notes["warnings"].append(f"{kinds.count(kind)} streams of {what}; the first is read")
         if self._header.table_at < 0:
             self._notes["warnings"].append(
-                "the recording was not finished: its disk was full, or its program was stopped"
+                "the recording was not finished: its disk was full, its camera lost, or its program stopped"
             )
 
     def _end_notes(self) -> None:

@@ -109,7 +109,9 @@ class RawReader:
         self._notes["format"] = NAMES[self.encoding]
         self._geometry = _geometry_of(header, options, self._warnings)
         if header.get("complete") == "no":
-            self._warnings.append("the recording was not finished: its disk was full, or its program was stopped")
+            self._warnings.append(
+                "the recording was not finished: its disk was full, its camera lost, or its program stopped"
+            )
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:

@@ -27,6 +27,9 @@ REMEMBERED = 5
 class Asking:
     """One question in flight at a time.
 
+    Where answers do not say which question they belong to, one that was asked again has two of them in flight. The
+    next answer may be to either; a second one, if it comes, comes in the pause that is then made.
+
     Parameters
     ----------
     every_ms
@@ -43,7 +46,8 @@ class Asking:
         self._lost_ns = round(silence_ms * lost_share * NS_PER_MS)
         self._asked_ns: int | None = None
         self._first_asked_ns = 0
-        self._next_ns = 0
+        self._next_ns = self._pause_until_ns = 0
+        self._asked_again = False
         self._silent_since_ns: int | None = None
         self._looked_ns: int | None = None
         self._waits_ns: deque[int] = deque(maxlen=REMEMBERED)
@@ -52,6 +56,11 @@ class Asking:
     def open(self) -> bool:
         """Whether a question waits for its answer."""
         return self._asked_ns is not None
+
+    @property
+    def twice(self) -> bool:
+        """Whether that question was asked more than once."""
+        return self._asked_again
 
     @property
     def remarks(self) -> Sequence[str]:
@@ -73,8 +82,16 @@ class Asking:
     def due(self, now_ns: int) -> bool:
         """Say whether it is time to ask, or to ask again."""
         if self._asked_ns is None:
-            return now_ns >= self._next_ns
+            return now_ns >= max(self._next_ns, self._pause_until_ns)
         return now_ns - self._asked_ns > self._patience_ns()
+
+    def pausing(self, now_ns: int) -> bool:
+        """Say whether an answer may still come that must not be taken for the next one."""
+        return now_ns < self._pause_until_ns
+
+    def asked_again(self) -> None:
+        """Note that there are two questions in flight that an answer may belong to."""
+        self._asked_again = True
 
     def asked(self, now_ns: int) -> None:
         """Note that a question left."""
@@ -89,6 +106,13 @@ class Asking:
         """Note that something came back, whatever it was; silence counts on."""
         self.late()
         self._asked_ns = None
+        if self._asked_again:
+            self._pause()
+
+    def gave_up(self) -> None:
+        """Note that a question will not be answered whole; what is left of its answer comes in the pause."""
+        self._asked_ns = None
+        self._pause()
 
     def late(self) -> None:
         """Note that an earlier question was answered, or one of several: answers take longer than thought."""
@@ -106,7 +130,8 @@ class Asking:
     def forget(self) -> None:
         """Begin anew: nothing was asked, nothing is missing."""
         self._asked_ns = self._silent_since_ns = None
-        self._next_ns = 0
+        self._next_ns = self._pause_until_ns = 0
+        self._asked_again = False
 
     def check(self, now_ns: int, hint: str) -> None:
         """Note that what had come was looked at; raise ``Trouble`` after too long a silence.
@@ -124,6 +149,10 @@ class Asking:
                 f"no valid reply for {silence_ms:.0f} ms (limit {self.silence_ms:.0f}); check the cable{hint}, or "
                 "raise lens.reply_ms"
             )
+
+    def _pause(self) -> None:
+        self._asked_again = False
+        self._pause_until_ns = (self._looked_ns or 0) + self._patience_ns()
 
     def _patience_ns(self) -> int:
         """Return how long to wait for an answer: twice what one took lately, and half the silence limit at most."""

@@ -369,7 +369,7 @@ class DirectLens:
     def _due(self, now: int) -> bool:
         """Ask at regular intervals, and as soon as the motor should rest: then somebody waits for the answer."""
         asking, look_ns = self._controller.asking, self._motor.look_ns
-        if asking.open or look_ns is None or look_ns - now > LOOK_AHEAD_NS:
+        if asking.open or asking.pausing(now) or look_ns is None or look_ns - now > LOOK_AHEAD_NS:
             return asking.due(now)
         if now < look_ns:
             return False  # an answer from before the rest would only keep the line from the one after it

@@ -32,7 +32,7 @@ from elpd_drivers.lenses.axis import (
     run_target,
     with_measured_stop,
 )
-from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US
+from elpd_drivers.lenses.grbl_dialect import DIALECTS
 from elpd_drivers.lenses.grbl_handshake import GrblLensSettings, handshake
 from elpd_drivers.lenses.grbl_lines import CANCEL, OUTPUTS, RESET, jog_line
 from elpd_drivers.lenses.grbl_talk import GrblTalk
@@ -150,6 +150,7 @@ class GrblLens:
         self._motor.stops += 1
         self._wish = None
         sent = self._talk.reset() if mode is StopMode.ABRUPT else self._line.send(CANCEL)
+        self._motor.written_ns = max(self._motor.written_ns, sent.done_ns - sent.begun_ns)
         self._note_stop(mode, sent)
         return CommandStamp(f"stop {mode.name.lower()}", sent.begun_ns, sent.done_ns)
 
@@ -186,7 +187,7 @@ class GrblLens:
     def close(self) -> None:
         """Stop if moving, and give the port back. Idempotent."""
         try:
-            if self._motor.report is None or self._motor.under_way:
+            if self._motor.may_move:
                 self._line.send(CANCEL)
         except LensError:
             pass  # the line is dead: the jog ends at its target
@@ -225,8 +226,8 @@ class GrblLens:
             raise Trouble(f"homing ended in state {self._talk.status.state if self._talk.status else 'unknown'}")
         self._motor.begin(report)
         self._motor.referenced, self._talk.locked_by_stop = True, False
-        if self._dialect.remembers:
-            self._talk.order(f"T{HOMED_BY_US}\n".encode("ascii"))
+        if self._dialect.homed_by_us:
+            self._talk.order(f"{self._dialect.homed_by_us}\n".encode("ascii"))
             while self._talk.unacknowledged:
                 self._talk.take(fuse=True)
                 self._wait(deadline, "no answer after homing; check the cable")
@@ -275,6 +276,7 @@ class GrblLens:
         )
         sent = self._line.send(line)
         motion = Motion(self._limits.acceleration_sps2, 0.0, float(target), speed_sps, SEGMENT_S)
+        self._motor.written_ns = sent.done_ns - sent.begun_ns
         number = self._motor.command(motion, sent.off_wire_ns + 2 * NS_PER_MS, 2 * NS_PER_MS)
         self._talk.unacknowledged.append(number)
         self._cruise_sps, self._talk.stopping, self._motor.stops_ignored = wish.speed_sps, False, 0

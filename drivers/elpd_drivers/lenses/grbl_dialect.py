@@ -9,9 +9,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-HOMED_BY_US = 197
-"""A tool number that says "homed, and not reset since" to the next program that opens the board."""
-
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
@@ -19,11 +16,13 @@ class Dialect:
 
     ``version`` matches its ``[VER:`` line. ``home`` is the line that homes the lens's axis; where ``one_axis_flag`` is
     given, only if ``$22`` has that flag, else ``$H``. ``stop_onset_ms`` is the time from a stop byte to the first
-    slower segment where nobody has calibrated it: so long is what was prepared. ``remembers`` says that a tool number
-    is kept until a reset and does nothing else, ``tells_homed`` that a full report (0x87) has a field for it. With
-    ``reset_after_alarm`` some alarms allow no homing before a reset, though status is answered. Between a switch that
-    is a hard limit and the travel it allows lies a share of the pull-off: ``spare``, at the end that is homed on and at
-    the other. ``origin_flag`` is that of ``$22`` which makes the place of homing zero.
+    slower segment where nobody has calibrated it: so long is what was prepared. ``homed_by_us`` is a word that does
+    nothing but is kept until a reset: it says "homed, and nothing went wrong since" to the next program that opens the
+    board. ``tells_homed`` says that a full report (0x87) has a field for homing, which must agree: it alone outlives a
+    reset at rest, by which a program says that it has lost its trust. With ``reset_after_alarm`` some alarms allow no
+    homing before a reset, though status is answered. Between a switch that is a hard limit and the travel it allows
+    lies a share of the pull-off: ``spare``, at the end that is homed on and at the other. ``origin_flag`` is that of
+    ``$22`` which makes the place of homing zero.
     """
 
     name: str
@@ -31,7 +30,7 @@ class Dialect:
     home: bytes
     stop_onset_ms: float
     stop_onset_sigma_ms: float
-    remembers: bool = False
+    homed_by_us: str = ""
     tells_homed: bool = False
     reset_after_alarm: bool = False
     spare: tuple[float, float] = (0.5, 0.0)
@@ -54,12 +53,13 @@ DIALECTS = (
         16.5,  # 13 to 20 ms in grblHAL's own simulator
         4.0,
         reset_after_alarm=True,
+        homed_by_us="F197",  # it takes no tool number without a tool change
         tells_homed=True,
         spare=(1.0, 1.0),
         one_axis_flag=2,
         origin_flag=8,
     ),
-    Dialect("GRBL", re.compile(r"\[VER:1\.1[a-z]?\."), b"$H\n", 45.0, 3.0, remembers=True),
+    Dialect("GRBL", re.compile(r"\[VER:1\.1[a-z]?\."), b"$H\n", 45.0, 3.0, homed_by_us="T197"),
 )
 
 

@@ -6,14 +6,13 @@ somebody else's jog. Each of these has an end in time here, and nothing is moved
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from elpd.errors import ConfigError, LensError
 from elpd.units import after_ms
 from elpd_drivers.lenses.axis import limits_from
-from elpd_drivers.lenses.grbl_dialect import DIALECTS, HOMED_BY_US, Dialect, dialect_of
+from elpd_drivers.lenses.grbl_dialect import DIALECTS, Dialect, dialect_of
 from elpd_drivers.lenses.grbl_lines import CANCEL, FULL_STATUS, RESET, STATUS, Status, parse_status
 from elpd_drivers.lenses.lines import LineReader
 
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from elpd.ports import Clock
     from elpd.records import LensLimits
     from elpd_drivers.lenses.line import Line
-
-_TOOL = re.compile(r"\bT(\d+)\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +55,7 @@ class GrblLensSettings:
 class BoardFacts:
     """What the board says about itself.
 
-    ``homed``: by this driver or by what the board says, and not reset since. ``home`` is the line that homes it.
+    ``homed``: by this driver, and not reset since. ``home`` is the line that homes it.
     ``restarted``: its banner came while it was looked at.
     """
 
@@ -112,8 +109,8 @@ class _Handshake:
         if status.state == "Alarm" and dialect.reset_after_alarm:
             status = self._reset()
         idle = status.state == "Idle"
-        homed = idle and dialect.remembers and self._tool() == HOMED_BY_US
-        if idle and dialect.tells_homed:
+        homed = idle and self._has_kept(dialect.homed_by_us)
+        if homed and dialect.tells_homed:
             homed = self._status(FULL_STATUS).homed
         home = dialect.home_line(board.get(22, 0.0))
         return BoardFacts(limits, board[100], board[130], idle, homed, self._restarted, dialect, home)
@@ -131,13 +128,9 @@ class _Handshake:
             self._status()
             return self._ask("$I", "[")
 
-    def _tool(self) -> int | None:
-        """Return the number of the tool that the board thinks it holds."""
-        for line in self._ask("$G", "[GC:"):
-            tool = _TOOL.search(line)
-            if tool is not None:
-                return int(tool[1])
-        return None
+    def _has_kept(self, word: str) -> bool:
+        """Say whether *word* is among the modes that the board is in."""
+        return word != "" and any(word in line.strip("[]").split() for line in self._ask("$G", "[GC:"))
 
     def _reset(self) -> Status:
         """Reset a board that is locked, and so has no position to lose; return its status after the banner."""

@@ -92,8 +92,12 @@ class GrblTalk:
             return report
         self.asking.check(now, "")
         if self.asking.due(now):
+            again = self.asking.open
             sent = self._line.send(STATUS)
-            self._sampled_from_ns = sent.off_wire_ns
+            if again:
+                self.asking.asked_again()  # the answer may be to the first one, and as old
+            else:
+                self._sampled_from_ns = sent.off_wire_ns
             self.asking.asked(sent.done_ns)
         return report
 

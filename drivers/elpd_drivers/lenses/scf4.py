@@ -328,7 +328,12 @@ class Scf4Controller:
 
     def ask(self) -> None:
         """Ask for everything there is."""
-        self._asked_off_ns = self._line.send(wire.STATUS).off_wire_ns
+        again = self.asking.open
+        sent = self._line.send(wire.STATUS)
+        if again:
+            self.asking.asked_again()  # the answer may be to the first one, and as old
+        else:
+            self._asked_off_ns = sent.off_wire_ns
 
     def read(self) -> Reading | None:
         """Take the lines that have come; a status that nobody waits for is late, or a duplicate."""

@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import structlog
+
 from elpd.errors import ConfigError, LensError, UsageError
 from elpd.motion.commanded import Motion
 from elpd.motion.trajectory import Timing
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from elpd.records import PositionEstimate
     from elpd_drivers.lenses.line import Line
 
+_log = structlog.get_logger()
+
 OLDEST_FIRMWARE = 5
 SLOWEST_PPS = 100
 START_S = 1e-4
@@ -51,6 +55,9 @@ PACE_ERROR = 0.02
 
 PAUSE_NS = 20 * NS_PER_MS
 """By how much earlier than that a motion must be over to have ended at the switch."""
+
+
+REMEDY = "name a file in lens.position_file, where the position is kept from one program to the next"
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +166,8 @@ class TheiaLens:
             self._motor.at_rest()
             now = self._clock.now_ns()
             self._remembered.keep(self._steps)
+            if not self._settings.position_file:
+                _log.warning("this board keeps no position, so the next program must home again", remedy=REMEDY)
             report = LensReport(0.0, now, now, 0.0)
             self._motor.begin(report)
             self._motor.report = report

@@ -281,7 +281,9 @@ class TicController:
     def _settle(self) -> None:
         """Let the reply that is under way arrive, and leave it: another question follows."""
         due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
-        while self.asking.open and len(self._received) < self._reply_length and self._line.looked_ns < due:
+        while self._line.looked_ns < due and (
+            self.asking.pausing(self._line.looked_ns) or (self.asking.open and len(self._received) < self._reply_length)
+        ):
             self._clock.sleep_until(after_ms(self._clock.now_ns(), 0.5))
             self._received += self._line.read()
         self.asking.forget()
@@ -295,17 +297,31 @@ class TicController:
 
     def ask(self) -> None:
         """Ask for position, velocity, flags and errors, and keep the command timeout from running out."""
+        again = self.asking.open
         self._received.clear()
         end = self._line.send(self._query_bytes).off_wire_ns
-        self._sampled_from_ns = end - (len(self._query_bytes) - self._query_head) * self._line.byte_ns
+        if again:
+            self.asking.asked_again()  # the answer may be to the first one, and as old
+        else:
+            self._sampled_from_ns = end - (len(self._query_bytes) - self._query_head) * self._line.byte_ns
 
     def read(self) -> Reading | None:
-        """Take the reply when all of it has come; without CRC only what cannot be is refused."""
+        """Take the reply when all of it has come; without CRC only what cannot be is refused.
+
+        The beginning of one whose rest does not come is given up: nothing is asked before the line had time to bring
+        the rest, so that it is not taken for the beginning of the next.
+        """
         self._received += self._line.read()
-        if not self.asking.open or len(self._received) < self._reply_length:
+        if not self.asking.open:
             return None
+        if len(self._received) < self._reply_length:
+            if self._received and self.asking.due(self._line.looked_ns):
+                self.asking.gave_up()
+            return None
+        # more than one can only be right where it was asked for again
+        raw = bytes(self._received[: self._reply_length if self.asking.twice else None])
         self.asking.answered()
-        reply = parse_reply(bytes(self._received), crc=self._settings.crc_responses)
+        reply = parse_reply(raw, crc=self._settings.crc_responses)
         self._received.clear()
         # it homes at speeds of its own settings
         if reply is None or (abs(reply.velocity_sps) > 2 * self.limits.max_speed_sps and not reply.flags & wire.HOMING):

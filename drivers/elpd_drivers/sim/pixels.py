@@ -6,7 +6,7 @@ fire; then it visits only those, eight notes at a time.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,10 +18,31 @@ if TYPE_CHECKING:
 BLOCK = 2048
 
 
+class Scratch(NamedTuple):
+    """Room for one block: the photoreceptors before the step, who may fire, and the same again by eights."""
+
+    before: NDArray[np.float32]
+    stirred: NDArray[np.uint8]
+    eights: NDArray[np.uint64]
+
+
+def scratch() -> Scratch:
+    """Make room for ``step_pixels``, to be used again and again."""
+    stirred = np.zeros(BLOCK, np.uint8)
+    return Scratch(np.empty(BLOCK, np.float32), stirred, stirred.view(np.uint64))
+
+
+@kernel()
+def keep(values: NDArray[np.float32], kept: NDArray[np.float32]) -> None:
+    """Copy *values* to the beginning of *kept*; assigning a slice would make numba ask for room of its own."""
+    for k in range(values.shape[0]):
+        kept[k] = values[k]
+
+
 @kernel(
     "int64(float32[::1], float32[::1], float32[::1], float32[::1], uint8[::1], uint8[::1], uint8[::1], int64[::1],"
-    "float32, float32, float32, int64, int64, int64, int64, int64[::1], int64[::1], uint8[::1])",
-    allocates=True,
+    "float32, float32, float32, int64, int64, int64, int64, int64[::1], int64[::1], uint8[::1],"
+    "float32[::1], uint8[::1], uint64[::1])"
 )
 def step_pixels(
     target: NDArray[np.float32],
@@ -42,6 +63,9 @@ def step_pixels(
     out_t: NDArray[np.int64],
     out_pixel: NDArray[np.int64],
     out_on: NDArray[np.uint8],
+    before: NDArray[np.float32],
+    stirred: NDArray[np.uint8],
+    eights: NDArray[np.uint64],
 ) -> int:
     """Advance all pixels from *begin_us* to *end_us* and append their events; return the new count of events.
 
@@ -49,7 +73,7 @@ def step_pixels(
     comparator's (updated), ``gain`` how much of the way to the target the photoreceptor goes in this step. A pixel
     whose ``held`` is 1 is in reset until ``release_us``. Thresholds are ``c·(1 + spread·(q - 128))`` with q from
     ``spread_on`` or ``spread_off``.
-    Events beyond the capacity of the outputs are counted but not kept.
+    Events beyond the capacity of the outputs are counted but not kept. The last three are a ``Scratch``.
     """
     capacity = out_t.shape[0]
     pixels = target.shape[0]
@@ -57,15 +81,12 @@ def step_pixels(
     one = np.float32(1)
     on_base, on_slope = c_on * (one - np.float32(128) * spread), c_on * spread
     off_base, off_slope = c_off * (one - np.float32(128) * spread), c_off * spread
-    before = np.empty(BLOCK, np.float32)
-    stirred = np.zeros(BLOCK, np.uint8)
-    eights = stirred.view(np.uint64)
     for start in range(0, pixels, BLOCK):
         stop = min(start + BLOCK, pixels)
         goal, now, base_, part = target[start:stop], level[start:stop], reference[start:stop], gain[start:stop]
         q_on, q_off, reset = spread_on[start:stop], spread_off[start:stop], held[start:stop]
         # Loops of few arrays each: the compiler gives up on vector code where it would have to prove many apart.
-        before[: stop - start] = now
+        keep(now, before)
         for k in range(stop - start):
             now[k] = before[k] + (goal[k] - before[k]) * part[k]
         for k in range(stop - start):

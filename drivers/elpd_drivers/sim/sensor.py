@@ -19,7 +19,7 @@ import numpy as np
 
 from elpd.records import BiasSet, Roi
 from elpd_drivers.sim.optics import CACHED_PIXELS
-from elpd_drivers.sim.pixels import fire_noise, sort_events, step_pixels
+from elpd_drivers.sim.pixels import fire_noise, scratch, sort_events, step_pixels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,6 +120,7 @@ class EventSensor:
         self._hot_pixel_hz = hot_pixel_hz
         self._mismatch_step = MISMATCH_STEP * (mismatch / MISMATCH_SD)
         self._lag_us = lag_us
+        self._scratch = scratch()
         self._unsettled_since_us = -NEVER_US
         self._unsettled = False
         unit = MISMATCH_SD / MISMATCH_STEP
@@ -238,7 +239,7 @@ class EventSensor:
             target.ravel(), self.level.ravel(), self._reference.ravel(), self._gain.ravel(),
             self._window_on.ravel(), self._window_off.ravel(), self._held.ravel(), self._release_us.ravel(),
             np.float32(biases.c_on), np.float32(biases.c_off), np.float32(self._mismatch_step), biases.refractory_us,
-            begin_us, end_us, self._count, self._out_t, self._out_pixel, self._out_on,
+            begin_us, end_us, self._count, self._out_t, self._out_pixel, self._out_on, *self._scratch,
         )  # fmt: skip
 
     def finish(self) -> Events:
