@@ -108,7 +108,7 @@ class WebSection(_Section):
 class ServiceSection(_Section):
     """The daemon: how it idles and how it is scheduled."""
 
-    poll_ms: Positive = 50.0
+    poll_ms: Positive = 100.0
     """How often an idle lens is asked where it is."""
     look_s: Positive = 0.1
     """How long an idle camera is listened to at a time."""

@@ -1,10 +1,10 @@
 """What a daemon costs that does nothing: ``python tools/idle_cost.py [--seconds 20] [--cold] [--json]``.
 
 Printed, not asserted. Each row is an `elpd serve` of its own. *Start*: from its call to READY, in seconds of the wall
-clock and of processor time, with kernels from the cache or (cold) compiled anew. *Idle*: processor time in per cent of
-one core, for so many seconds in which nobody asks, and with one client that listens to all events and asks for the
-status twice a second. *Memory*, MB, once READY: resident, of which private to this process (the rest is the files of
-libraries, shared and given back when memory is short).
+clock and of processor time, with kernels from the cache or (cold) compiled anew, by two processes beside it whose time
+counts with it. *Idle*: processor time in per cent of one core, for so many seconds in which nobody asks, and with one
+client that listens to all events and asks for the status twice a second. *Memory*, MB, once READY: resident, of which
+private to this process (the rest is the files of libraries, shared and given back when memory is short).
 
 The simulated rig computes its world in the same process. `recording` is a rig without one: a resting sensor's noise as
 the camera, at its own pace in packets of a millisecond, and a simulated Tic behind a pty, in a process of its own.
@@ -78,7 +78,8 @@ def cost(
 ) -> dict[str, Any]:
     """Run a daemon and return what it costs."""
     with daemon(folder, environment or {}, settings) as (process, path, start_s):
-        row: dict[str, Any] = {"name": name, "start_s": start_s, "start_cpu_s": processor_s(process)}
+        start_cpu_s = processor_s(process, with_children=True)
+        row: dict[str, Any] = {"name": name, "start_s": start_s, "start_cpu_s": start_cpu_s}
         row["ready"] = memory_mb(process)
         time.sleep(SETTLED_S)
         row["idle_percent"] = _percent(process, seconds, time.sleep)

@@ -9,7 +9,7 @@ and backlash, an asymmetric lens, unequal thresholds and the place of focus itse
 at both. It is fitted to all pairs at once, ``m = z_up/down ± v·τ``, for each class of brightness. The refractory
 period (an event stands for the level at its end, and so comes early) and an error of the clock between camera and lens
 shift all pixels alike: the line ``τ = τ_0 + τ_1·s`` over the slowness s (1 for the brightest parts, in inverse
-proportion to light, as ``elpd.vision.crossing`` counts it) keeps them apart in τ_0.
+proportion to light, as ``elpd.vision.slowness`` counts it) keeps them apart in τ_0.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class _Crossings:
 
 
 def slowness_of(brightness: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how many times slower than the brightest a photoreceptor is; as ``elpd.vision.crossing`` has it."""
+    """Return how many times slower than the brightest a photoreceptor is; as ``elpd.vision.slowness`` has it."""
     slow: NDArray[np.float64] = (1.0 + DARK) / (np.maximum(brightness, 0.0) + DARK)
     return slow
 

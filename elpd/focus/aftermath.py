@@ -1,6 +1,6 @@
 """What is made of a sweep once its stop has been sent: where focus was, and what further passes over it add.
 
-The witnesses of ``vision.crossing`` are asked after the stop, of the events that the sweep has left, and again after
+The witnesses of ``vision.witness`` are asked after the stop, of the events that the sweep has left, and again after
 every further pass. The events of the way back are counted: reports alone prove no motion.
 """
 
@@ -13,8 +13,9 @@ from elpd.focus.course import Course
 from elpd.focus.frame_track import FrameTrack
 from elpd.focus.passes import NO_PLAY, Pass, Passes, Play
 from elpd.units import SensorUs
-from elpd.vision.crossing import DARK, DARK_OF_MAP, WIDTHS_PER_DEPTH_OF_FOCUS
 from elpd.vision.sharpest import sharpest
+from elpd.vision.slowness import DARK, DARK_OF_MAP
+from elpd.vision.witness import WIDTHS_PER_DEPTH_OF_FOCUS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.units import SensorUs
-from elpd.vision.crossing import frame_witness, fuse, lamp_witness
 from elpd.vision.drift import find_drift
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
+from elpd.vision.witness import frame_witness, fuse, lamp_witness
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import FocusEstimate
-    from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
+    from elpd.vision.witness import EventWitnesses, Witness
 
 PATH_STEP_US = 250
 """The lens path is sampled this finely for the estimate: at 100 times gravity it bends by 0.03 um in that time."""
@@ -85,7 +85,7 @@ class Pass:
         """Ask the events and frames of this pass.
 
         *unexplained* is the share of the lag that may be wrong, *dark* the dark current that *brightness* does not
-        show (both as in ``vision.crossing``).
+        show (as in ``vision.witness`` and ``vision.slowness``).
         Where the scene moves, its turns make mirrors: pairs, and what they tell of depths and lag, are not asked.
         """
         memory = self.memory

@@ -16,19 +16,14 @@ import numpy as np
 from elpd.focus import guards
 from elpd.focus.settings import MAX_SIGMA_DOF
 from elpd.records import Direction, FocusEstimate, Outcome
-from elpd.vision.crossing import (
-    ROI_MARGIN_PX,
-    WIDTHS_PER_DEPTH_OF_FOCUS,
-    Witness,
-    frame_witness,
-    fuse,
-)
+from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import Detector
 from elpd.vision.filters import PixelCap
 from elpd.vision.memory import MIN_EVENTS, EventMemory
 from elpd.vision.meter import TRAVEL_PER_DEPTH_OF_FOCUS, Meter, Windows, WindowsByEvents, WindowsByTravel
 from elpd.vision.reference import Reference, check_size, reference_from_frame
 from elpd.vision.track import FrameEnergy, PeakTrack
+from elpd.vision.witness import WIDTHS_PER_DEPTH_OF_FOCUS, Witness, frame_witness, fuse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from elpd.config import Config
     from elpd.events.decoder import EventArrays
     from elpd.ports import RigParts
-    from elpd.records import CameraPacket
+    from elpd.records import Frame
     from elpd.service.engine_port import Answer, Caller, ClientCounts, Request
     from elpd.service.messages import Event, Result, Status
     from elpd.service.timing import Time
@@ -288,12 +288,12 @@ class RigEngine:
         self.autopilot.ended(job, answer, self._work.session)
         self.backroom.also(self._books.save)
 
-    def _hear(self, packet: CameraPacket, events: EventArrays) -> None:
+    def _hear(self, frame: Frame | None, events: EventArrays) -> None:
         """Take what the idle camera says."""
         position_um = self.situation.lens.position_um
         parts = self.keeper.parts
-        if packet.frames:
-            self.album.keep_frame(packet.frames[-1], position_um)
+        if frame is not None:
+            self.album.keep_frame(frame, position_um)
         if parts is not None:
             self.album.keep_events(events, parts.camera.geometry, position_um)
             self.autopilot.hear(events)

@@ -10,17 +10,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from elpd.errors import CameraError, LensError
+from elpd.events.decoder import EventArrays
 from elpd.events.stream import PacketDecoder
 from elpd.records import Geometry, LensFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from elpd.config import ServiceSection
-    from elpd.events.decoder import EventArrays
     from elpd.ports import RigParts
-    from elpd.records import CameraPacket, LensReport
+    from elpd.records import Frame, LensReport
     from elpd.service.situation import Situation
     from elpd.service.timing import Time
 
@@ -55,7 +57,7 @@ class Idle:
     settings
         How often to look.
     hear
-        Takes every packet with its events (views); for pictures and evidence.
+        Takes a turn's newest frame, if there was one, and its events; for pictures and evidence.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class Idle:
         situation: Situation,
         time: Time,
         settings: ServiceSection,
-        hear: Callable[[CameraPacket, EventArrays], None],
+        hear: Callable[[Frame | None, EventArrays], None],
     ) -> None:
         self._situation = situation
         self._time = time
@@ -185,7 +187,8 @@ class Idle:
     def _listen(self, parts: RigParts) -> None:
         """Take what has come in a turn."""
         self._time.nap(LISTEN_TURN_S)
-        events, lost, backlog, frames = 0, 0, 0, False
+        pieces: list[EventArrays] = []
+        events, lost, backlog, frame = 0, 0, 0, None
         for _ in range(MOST_PACKETS_A_TURN):
             packet = parts.camera.read(0.0)
             if packet is None:
@@ -197,8 +200,10 @@ class Idle:
             assert self._decoder is not None, "a look begins with a decoder"
             heard = self._decoder.feed(packet)
             events, lost = events + int(heard.t.size), lost + packet.lost_events
-            backlog, frames = packet.backlog, frames or bool(packet.frames)
-            self._hear(packet, heard)
+            backlog, frame = packet.backlog, packet.frames[-1] if packet.frames else frame
+            pieces.append(EventArrays(heard.t.copy(), heard.x.copy(), heard.y.copy(), heard.p.copy()))
+        if pieces:
+            self._hear(frame, joined(pieces))
         silent_s = self._time.now_s() - self._last_packet_s
         if silent_s > SILENCE_S:
             raise CameraError(
@@ -207,4 +212,14 @@ class Idle:
             )
         self._events += events
         if self._attentive or lost:
-            self._situation.heard(events, lost, backlog=backlog, **({"has_frames": True} if frames else {}))
+            self._situation.heard(events, lost, backlog=backlog, **({"has_frames": True} if frame else {}))
+
+
+def joined(pieces: Sequence[EventArrays]) -> EventArrays:
+    """Return the events of several packets as one."""
+    return EventArrays(
+        np.concatenate([one.t for one in pieces]),
+        np.concatenate([one.x for one in pieces]),
+        np.concatenate([one.y for one in pieces]),
+        np.concatenate([one.p for one in pieces]),
+    )

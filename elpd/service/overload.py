@@ -9,6 +9,7 @@ line, so for it this changes nothing.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
@@ -28,9 +29,12 @@ def waited_s(tasks: Path = TASKS) -> float:
     """Return how long this process's threads have stood in line for a processor; 0 where the kernel does not tell."""
     total_ns = 0
     with suppress(OSError):
-        for task in tasks.iterdir():
-            with suppress(OSError, ValueError, IndexError):  # a thread that ended meanwhile
-                total_ns += int((task / "schedstat").read_text().split()[1])
+        for task in os.listdir(tasks):  # noqa: PTH208  (asked ten times a second, of every thread)
+            with (
+                suppress(OSError, ValueError, IndexError),  # a thread that ended meanwhile
+                open(f"{tasks}/{task}/schedstat", "rb", 0) as file,  # noqa: PTH123
+            ):
+                total_ns += int(file.read().split()[1])
     return 1e-9 * total_ns
 
 

@@ -17,7 +17,9 @@ zero for edges. Half of that is asked for, by as many standard deviations as ``F
 
 Stamps that lie on a grid (a camera's coarse clock, a sensor that was simulated picture by picture) are samples, and
 show no frequency above half the grid's: beyond it, what the sweep itself does slowly is seen again, as a line of the
-grid's own frequency less its own. So the bins are whole steps of the grid, and faster lines are not looked for.
+grid's own frequency less its own. So the bins are whole steps of the grid, and faster lines are not looked for. Where
+only some of the stamps lie on a grid, a line must be more than twice as high as that share of them (the grid's own line
+in the count of all events, whatever their sign) of the slow swing that it may be the mirror image of.
 
 What a lamp does to a pixel's level is undone after a whole period, whatever its depth, as long as the pixel can follow.
 So sums over whole periods are free of it; ``residue`` says how well that holds for this sensor and this lamp.
@@ -35,9 +37,6 @@ if TYPE_CHECKING:
 
 BIN_US = 250
 """Lamps of up to 1 kHz have four bins a period; a faster one is averaged away by the photoreceptors."""
-
-OFF_GRID = 0.01
-"""Share of the intervals between stamps that may be shorter than the grid on which the others lie."""
 
 HIGHEST_HZ = 1_000.0
 LOWEST_HZ = 45.0
@@ -59,6 +58,9 @@ RECURRENCE_SIGMAS = 4.8
 
 NEARLY = 0.5
 """Power of a line over that of the highest from which on the lower frequency is believed."""
+
+MIRRORED = 0.5
+"""Share of a line that is explained by slower swings, mirrored at a frequency at which events of either sign come."""
 
 STEPS_PER_RESOLUTION = 8
 
@@ -116,9 +118,10 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
         return None
     independent = max(1.0, (highest - lowest) * span_s)
     finer = STEPS_PER_RESOLUTION * bins
-    frequencies = np.fft.rfftfreq(finer, 1e-6 * bin_us).astype(np.float64)
-    within = (frequencies >= lowest) & (frequencies <= highest)
-    frequencies, amplitude = frequencies[within], np.abs(np.fft.rfft(taper * swing, finer)[within])
+    every = np.fft.rfftfreq(finer, 1e-6 * bin_us).astype(np.float64)
+    swings = np.abs(np.fft.rfft(taper * swing, finer))
+    within = (every >= lowest) & (every <= highest)
+    frequencies, amplitude = every[within], swings[within]
     variance = float(np.square(taper) @ count) * max(1.0 - mean**2, 1e-3)
     power = amplitude**2 / max(variance, 1e-12)
     power /= max(1.0, float(np.median(power)) / np.log(2.0))
@@ -127,16 +130,22 @@ def find_line(t_us: NDArray[np.int64], on: NDArray[np.uint8], begin_us: int, end
     share = float(2.0 * amplitude[top] / max(float(taper @ count), 1e-12))
     if false_alarm > FALSE_ALARM or share < LEAST_SHARE:
         return None
+    here = top + int(np.argmax(within))
+    comb = np.abs(np.fft.rfft(taper * count, finer))[here : here + int(np.searchsorted(every, LOWEST_HZ))]
+    mirrored = float((comb * swings[: comb.size]).max()) / max(float(taper @ count), 1e-12)
+    if mirrored > MIRRORED * float(amplitude[top]):
+        return None
     return Flicker(_refined(frequencies, power, top), min(share, 1.0), false_alarm)
 
 
 def stamp_grid_us(t_us: NDArray[np.int64]) -> int:
-    """Return the step of the grid on which stamps lie, in any order: what is between all but ``OFF_GRID`` of them.
+    """Return the step of the grid on which most stamps lie, in any order: their usual interval.
 
-    One where there are none, and no more than a few microseconds where a clock is as fine as that.
+    Some may lie between: simulators share out what is too much for one step. Stamps of a fine clock are as far apart as
+    events are scarce, and of so few none would show a faster line.
     """
     stamps = np.unique(t_us)
-    return int(np.quantile(np.diff(stamps), OFF_GRID, method="lower")) if stamps.size > 1 else 1
+    return max(1, int(np.median(np.diff(stamps)))) if stamps.size > 1 else 1
 
 
 def _recurs(

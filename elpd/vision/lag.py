@@ -31,7 +31,7 @@ DECADES = 0.5
 
 TYPICAL_SLOWNESS, SPREAD = 4.8, 3.4
 """How many times slower than the brightest a pixel is, mean and standard deviation, where no picture tells: evenly
-spread over the powers of ten between one and what dark current leaves of the light (``crossing.DARK``)."""
+spread over the powers of ten between one and what dark current leaves of the light (``slowness.DARK``)."""
 
 OTHER_LIGHT = 0.5
 """How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.crossing import DARK, LEAST_LEVEL, ROI_MARGIN_PX, ask_events
+from elpd.vision.crossing import LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain, stamp_events
@@ -22,6 +22,7 @@ from elpd.vision.lag import UNMEASURED_LAG_US, LagPrior
 from elpd.vision.planes import FLANK
 from elpd.vision.rebuilt import EventStretch
 from elpd.vision.refractory import Refractory, refractory_period
+from elpd.vision.slowness import DARK
 from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
 if TYPE_CHECKING:
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.records import Geometry, Roi, SensorProfile
-    from elpd.vision.crossing import EventWitnesses, Witness
     from elpd.vision.flicker import Flicker
     from elpd.vision.integral import Vertex
     from elpd.vision.ruler import Ruler
+    from elpd.vision.witness import EventWitnesses, Witness
 
 MIN_EVENTS = 1_000
 """Fewer events between the flank of the peak and now make no image worth a vertex."""

@@ -153,8 +153,8 @@ class Turns:
         for _ in range(_BENDS):
             late = lateness(times, self.gap[use], float(found.at[1]))
             found = one.fit(late, found.at, found.cut, _AGAIN)
-        if found.scatter > LEAST_ORDER * _RANDOM * self.reach:
-            return None, slowness.times
+        if found.scatter > LEAST_ORDER * _RANDOM * self.reach or not found.weights.any():
+            return None, slowness.times  # pairs anywhere, or in heaps that no line goes through
         variance = one.jackknife(late, found, self.block[use], blocks)
         slope, kept = float(found.at[1]), found.weights
         x = late - float(np.average(late, weights=kept))
@@ -208,6 +208,8 @@ class _Regression:
         kept = self._weights
         for _ in range(rounds):
             at, kept, residual = _step(design, self._middle, self._weights, at, cut)
+            if not kept.any():
+                break
             inside = np.abs(residual) <= cut
             scatter = _median(np.abs(residual[inside]), self._weights[inside]) / 0.6745
             cut = min(cut, max(BIWEIGHT * scatter, 1e-9 * cut))

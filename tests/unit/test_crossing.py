@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elpd.vision.bands import BandFocus, average_focus, band_energies, focus_of_bands
-from elpd.vision.crossing import Witness, frame_witness, fuse
 from elpd.vision.drift import find_drift
 from elpd.vision.integral import (
     BANDS_PX,
@@ -23,6 +22,7 @@ from elpd.vision.integral import (
     stamp_events,
 )
 from elpd.vision.track import EventEnergy, PeakTrack
+from elpd.vision.witness import Witness, frame_witness, fuse
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.floats(0.001, 1.0)), min_size=1, max_size=40))

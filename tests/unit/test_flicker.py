@@ -96,8 +96,11 @@ def test_a_lamp_is_found_although_an_edge_goes_by() -> None:
 def test_the_grid_of_a_coarse_clock_is_no_lamp_and_hides_none(grid_us: float) -> None:
     t, pixel, on = lamp(2.0, depth=40.0)  # what a sweep does: every pixel once up and down
     stamps = np.rint(np.ceil(t / grid_us) * grid_us).astype(np.int64)
-    assert stamp_grid_us(stamps) == int(grid_us)
+    assert stamp_grid_us(stamps) == pytest.approx(grid_us, abs=1.0)
     assert find_line(stamps, on, 0, SPAN_US) is None
+    between = np.random.default_rng(4).random(stamps.size) < 0.05
+    strayed = stamps - np.where(between & (stamps % 5 == 0), int(grid_us) // 2, 0)
+    assert find_line(np.sort(strayed), on, 0, SPAN_US) is None
     t, pixel, on = lamp(100.0)
     found = find_flicker(np.rint(np.ceil(t / grid_us) * grid_us).astype(np.int64), pixel, on, 0, SPAN_US)
     assert found is not None
@@ -105,7 +108,7 @@ def test_the_grid_of_a_coarse_clock_is_no_lamp_and_hides_none(grid_us: float) ->
 
 
 def test_stamps_at_random_lie_on_no_grid() -> None:
-    assert stamp_grid_us(noise(2, 3000)[0]) == 1
+    assert stamp_grid_us(noise(2, 3000)[0]) < 20
     assert stamp_grid_us(np.array([7], dtype=np.int64)) == 1
 
 

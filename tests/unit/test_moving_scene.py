@@ -11,7 +11,7 @@ from sweep_world import picture
 
 from elpd.vision import crossing
 from elpd.vision.bands import BandFocus, average_focus, focus_of_bands
-from elpd.vision.crossing import EventWitnesses, ask_events
+from elpd.vision.crossing import ask_events
 from elpd.vision.integral import BANDS_PX
 from elpd.vision.pairs import Mode
 from elpd.vision.rebuilt import EventStretch
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+
+    from elpd.vision.witness import EventWitnesses
 
 MARGIN = 14
 STEPS = 160

@@ -12,8 +12,8 @@ from elpd.focus import passes as room
 from elpd.focus.heading import Stale
 from elpd.focus.passes import NO_PLAY, Passes
 from elpd.records import Geometry, Roi
-from elpd.vision.crossing import Witness
 from elpd.vision.memory import BuiltImage, EventMemory
+from elpd.vision.witness import Witness
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

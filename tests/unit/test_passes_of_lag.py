@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from elpd.focus import passes as said_of
-from elpd.vision.crossing import Witness
+from elpd.vision.witness import Witness
 
 WHEN = (0.0, 1.0)
 

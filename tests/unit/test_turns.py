@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes_of_turns import turns_of_a_lag
 
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
-from elpd.vision.turns import Line, Slowness, blocks_of, lateness
+from elpd.vision.turns import Line, Slowness, Turns, blocks_of, lateness
 
 
 def test_the_lag_of_dark_pixels_is_measured() -> None:
@@ -154,3 +154,14 @@ def test_slowness_is_told_apart_into_what_is_local_and_what_is_not() -> None:
     assert slowness.beyond[20, 10] == pytest.approx(np.log(3.0), abs=0.1)
     here = slowness.at(np.array([20], np.uint16), np.array([10], np.uint16))
     assert here.times.tolist() == [6.0]
+
+
+@pytest.mark.parametrize("seed", [1, 4, 6])
+def test_pairs_in_two_heaps_have_no_line_between_them(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 300
+    middle = np.where(rng.random(count) < 0.5, -30.0, 30.0)
+    even = np.ones(count)
+    turns = Turns(middle, even, even, np.arange(count) % 64, 0.0, 8.0, 33.0)
+    line, late = turns.line(Slowness(rng.uniform(1.0, 20.0, count), np.zeros(count)))
+    assert line is None
+    assert late.shape == (count,)

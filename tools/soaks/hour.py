@@ -220,7 +220,7 @@ def _server(path: Path) -> int:
     return process
 
 
-def processor_s(process: int) -> float:
-    """Return how much processor time a process has used."""
+def processor_s(process: int, *, with_children: bool = False) -> float:
+    """Return how much processor time a process has used, and, if asked, the children that it has waited for."""
     fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return sum(map(int, fields[11 : 15 if with_children else 13])) / os.sysconf("SC_CLK_TCK")

@@ -209,7 +209,7 @@ class _Splitter:
         if piece.encoding is Encoding.ARRAY:
             if piece is not self._piece:
                 self._take_times(piece)
-            return position + int(np.searchsorted(self._rising[position:], until_us))
+            return position + int(self._rising[position:].searchsorted(until_us))
         position = SPLITTERS[piece.encoding](piece.data, position, self._state, until_us, self._held)
         if self._state[HIGH] >= 0:
             self._check(time_of(self._state, *_bits(piece.encoding)))
@@ -261,6 +261,8 @@ T = TypeVar("T")
 
 def _take(waiting: list[T], times_us: Sequence[int], until_us: int) -> tuple[T, ...]:
     """Remove from *waiting*, and return, what belongs before *until_us*."""
+    if not waiting:
+        return ()
     ready = sum(t_us < until_us for t_us in times_us)
     taken = tuple(waiting[:ready])
     del waiting[:ready]
