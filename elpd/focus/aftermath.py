@@ -78,6 +78,8 @@ class Aftermath:
         self.events_back = 0
         """Events in the region on the way back, from ``back_from_us`` on."""
         self.back_from_us = FOR_EVER
+        self._lost = 0.0
+        """What the image had lost of log S before a way to focus, at the most."""
 
     @property
     def scene_moves(self) -> bool:
@@ -155,14 +157,14 @@ class Aftermath:
         """Return how much sharper the image became on the way back, as a share of what it had lost since its peak.
 
         The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once
-        after each way, with the lens at rest.
+        after each way, with the lens at rest; a second way is held against the first's loss if its own is less.
         """
         track = self._hearing.memory.track
         if not self.scene_moves or self._hearing.lamp is not None or not track.drop > 0.0:
             return None
-        lost, far = track.drop, track.values[-1]
+        self._lost, far = max(track.drop, self._lost), track.values[-1]
         self.look()
-        return (track.values[-1] - far) / lost
+        return (track.values[-1] - far) / self._lost
 
     def look(self) -> None:
         """Measure how sharp the image is that all events have built."""
