@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
+import structlog
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from elpd import __version__
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
 
     from elpd.config import Config
     from elpd.ports import EventCamera, Lens
+
+_log = structlog.get_logger(__name__)
 
 _SIMULATED_LENS = ("board", "travel_um", "backlash_um", "acceleration_um_s2", "microstep_error_um", "cam")
 _SIMULATED_SENSOR = ("seed", "camera", "width", "height", "noise_hz", "leak_hz", "hot_pixels", "hot_pixel_hz",
@@ -169,6 +174,31 @@ def save(directory: Path, profile: Profile) -> Path:
             "free some space or set state.directory"
         ) from None
     return path
+
+
+def make_room(directory: Path, kind: type[Profile]) -> None:
+    """See before anything is measured that a profile can be kept; set one aside that nobody can read.
+
+    A damaged file, or one of another version, is renamed to end in ``.unreadable``. Raises ``UsageError`` where nothing
+    can be written.
+    """
+    path = path_of(directory, kind)
+    try:
+        load(directory, kind)
+    except FormatError as error:
+        aside = path.with_name(f"{path.name}.unreadable")
+        with suppress(OSError):  # what cannot be renamed cannot be written either
+            path.replace(aside)
+            _log.warning("profile set aside", path=str(aside), reason=str(error).partition("; ")[0])
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise UsageError(
+            f"{path}: the profile could not be written ({error.strerror or error}); set state.directory to a folder "
+            "of yours, or measure with --dry-run"
+        ) from None
 
 
 def load(directory: Path, kind: type[P]) -> P | None:

@@ -67,11 +67,13 @@ def command(
         if value is not None and not 0 <= value < 1e5:
             raise UsageError(f"{name} is {value:g}; it takes 0 to 100000 microseconds")
     given = None if threshold is None else _parse_threshold(threshold)
-    from elpd.calibrate.aperture import combine, measured_on  # noqa: PLC0415  (numba and devices only now)
+    from elpd.calibrate.aperture import ApertureCalibration, combine, measured_on  # noqa: PLC0415  (numba only now)
     from elpd.calibrate.opening import Pixels, measure_opening  # noqa: PLC0415
-    from elpd.calibrate.profile import save, state_directory  # noqa: PLC0415
+    from elpd.calibrate.profile import make_room, save, state_directory  # noqa: PLC0415
 
     c, c_sigma = given or _stored_threshold(config)
+    if not dry_run:
+        make_room(state_directory(config), ApertureCalibration)
     if path is None:
         geometry, taken = _on_the_rig(config, openings, quiet=as_json)
     else:

@@ -46,10 +46,12 @@ def command(
     from elpd.calibrate.backlash import measure_backlash  # noqa: PLC0415
     from elpd.calibrate.in_use import as_measured  # noqa: PLC0415
     from elpd.calibrate.live import take_evidence  # noqa: PLC0415
-    from elpd.calibrate.play import backlash_calibration  # noqa: PLC0415
-    from elpd.calibrate.profile import MeasuredOn, save, state_directory  # noqa: PLC0415
+    from elpd.calibrate.play import BacklashCalibration, backlash_calibration  # noqa: PLC0415
+    from elpd.calibrate.profile import MeasuredOn, make_room, save, state_directory  # noqa: PLC0415
     from elpd.focus.settings import CycleSettings  # noqa: PLC0415
 
+    if not dry_run:
+        make_room(state_directory(config), BacklashCalibration)
     config = as_measured(config)
     settings = CycleSettings.from_config(config)
     depth_of_focus_um = settings.depth_of_focus_um

@@ -65,9 +65,11 @@ def command(
     config = load(config_path, overrides)
     if plot is not None and not plot.resolve().parent.is_dir():
         raise UsageError(f"--plot {plot}: there is no folder {plot.resolve().parent}; make it first")
-    from elpd.calibrate.lens import keep, read_table, with_part  # noqa: PLC0415  (numpy and devices only now)
-    from elpd.calibrate.profile import MeasuredOn  # noqa: PLC0415
+    from elpd.calibrate.lens import LensCalibration, keep, read_table, with_part  # noqa: PLC0415  (numpy only now)
+    from elpd.calibrate.profile import MeasuredOn, make_room, state_directory  # noqa: PLC0415
 
+    if not dry_run:
+        make_room(state_directory(config), LensCalibration)
     trips: tuple[int, ...] = ()
     if table is not None:
         rows = read_table(table, config.lens.um_per_step)

@@ -85,10 +85,12 @@ def command(
     if path is None and rest_us is not None:
         raise UsageError("--rest-us is about a recording; give PATH, or --rest-s for the rig")
     from elpd.calibrate.plot import draw  # noqa: PLC0415  (numba and devices only now)
-    from elpd.calibrate.profile import save, state_directory  # noqa: PLC0415
-    from elpd.calibrate.sensor import measure_sensor  # noqa: PLC0415
+    from elpd.calibrate.profile import make_room, save, state_directory  # noqa: PLC0415
+    from elpd.calibrate.sensor import SensorCalibration, measure_sensor  # noqa: PLC0415
 
     if path is None:
+        if not dry_run:
+            make_room(state_directory(config), SensorCalibration)
         evidence, on, depth_of_focus_um = _on_the_rig(config, rest_s, reach_um, black, keep, here=here, quiet=as_json)
     else:
         evidence, on, depth_of_focus_um = _recorded(path, rest_us, config)

@@ -36,9 +36,6 @@ spread over the powers of ten between one and what dark current leaves of the li
 OTHER_LIGHT = 0.5
 """How much of a calibrated lag another light may change: photoreceptors are as fast as their light lets them be."""
 
-_FAR, _CELLS = 6.0, 401
-"""How many standard errors the distribution of a measured lag is drawn to, and how finely."""
-
 
 @dataclass(frozen=True, slots=True)
 class Lag:
@@ -81,13 +78,12 @@ class LagPrior:
 
 
 def expected_lag(line: Line | None, median: float) -> Lag:
-    """Return the mean and standard deviation of what is known after a measurement.
+    """Return what is known of a lag after a measurement, and its standard error.
 
     Before it, the lag has the log-normal distribution of that *median* and of ``DECADES``: a mean of twice its median,
     a standard deviation of three times. Its peak is at a quarter of the median, which is an opinion about how bright
-    rooms are; a measurement that is better than the expectation is not drawn there but asks only how long the tail is
-    (an exponential distribution of the same standard deviation), and what that moves it by is in the error. A
-    measurement that is worse adds nothing.
+    rooms are, so a measurement that is better than the expectation is not drawn there but stands for itself: the most
+    likely lag that is not negative. A measurement that is worse adds nothing.
     """
     if median <= 0.0:
         return Lag()
@@ -96,14 +92,7 @@ def expected_lag(line: Line | None, median: float) -> Lag:
     usual = Lag(mean, mean * sqrt(expm1(width**2)))
     if line is None or line.sigma >= usual.sigma:
         return usual
-    tilted = line.slope - line.sigma**2 / usual.sigma
-    lag = np.linspace(max(0.0, tilted - _FAR * line.sigma), max(tilted, 0.0) + _FAR * line.sigma, _CELLS)
-    logarithm = -0.5 * np.square((lag - tilted) / line.sigma)
-    share = np.exp(logarithm - logarithm.max())
-    share /= share.sum()
-    at = float(share @ lag)
-    own = sqrt(float(share @ np.square(lag - at)))
-    return Lag(at, float(np.hypot(own, min(abs(at - max(line.slope, 0.0)), line.sigma))))
+    return Lag(max(line.slope, 0.0), line.sigma)
 
 
 def weights_of_lines(lines: Sequence[Line | None]) -> NDArray[np.float64]:

@@ -209,11 +209,10 @@ class EventMemory:
         return refractory_period(t_us, x, y, self._shape)
 
     def flicker(self) -> Flicker | None:
-        """Return a lamp's flicker, if the events show one."""
-        if self._count == 0:
+        """Return a lamp's flicker, if the events up to the last ``advance`` show one."""
+        if self._taken == 0:
             return None
-        t_us = self._t_us
-        _, x, y, on = (column[: self._count] for column in self._columns)
+        t_us, x, y, on = (column[: self._taken] for column in self._columns)
         pixel = y.astype(np.int64) * self._shape[1] + x
         return find_flicker(t_us, pixel, on, int(t_us[0]), int(t_us[-1]) + 1)
 

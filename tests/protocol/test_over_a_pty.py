@@ -140,7 +140,7 @@ def test_a_run_over_a_pty_reverses_and_ends_by_itself(kind: str, board: Any) -> 
     lens = open_lens(kind, server.port)
     lens.run(SPEED_SPS / 8, after_ms(CLOCK.now_ns(), 60_000))
     going_up = poll_until(lens, lambda report: report.moving and report.steps > 3210)
-    lens.run(-SPEED_SPS / 8, after_ms(CLOCK.now_ns(), 500))
+    lens.run(-SPEED_SPS / 2, after_ms(CLOCK.now_ns(), 5000))  # time enough for a busy machine to turn round in
     turned = poll_until(lens, lambda report: report.steps < going_up.steps - 20)
     assert turned.steps > 0
     poll_until(lens, lambda report: not report.moving)

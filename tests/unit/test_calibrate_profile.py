@@ -11,7 +11,7 @@ import pytest
 from scripted_rig import Camera, Script
 
 from elpd.calibrate import profile
-from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, save, state_directory
+from elpd.calibrate.profile import MeasuredOn, Profile, load, make_room, path_of, save, state_directory
 from elpd.calibrate.quantity import Quantity
 from elpd.calibrate.sensor import SensorCalibration, sensor_in_use
 from elpd.config import load as load_config
@@ -73,6 +73,23 @@ def test_a_file_that_is_not_whole_is_an_error_with_a_way_out(tmp_path: Path, spo
     path.write_text(spoil(path.read_text()))
     with pytest.raises(FormatError, match=f"{told}.*(run `elpd calibrate focal` again|delete the file)"):
         load(tmp_path, Focal)
+
+
+@pytest.mark.parametrize("torn", ["{", '{"kind": "focal", "version": 99}'])
+def test_what_nobody_can_read_is_set_aside_before_measuring_again(tmp_path: Path, torn: str) -> None:
+    path_of(tmp_path, Focal).write_text(torn, encoding="utf-8")
+    make_room(tmp_path, Focal)
+    assert load(tmp_path, Focal) is None
+    assert (tmp_path / "focal.json.unreadable").read_text(encoding="utf-8") == torn
+    save(tmp_path, focal())
+    make_room(tmp_path, Focal)
+    assert load(tmp_path, Focal) == focal(), "a good one stays"
+
+
+def test_a_place_that_cannot_be_written_is_known_before_measuring(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"could not be written .*--dry-run"):
+        make_room(tmp_path / "file" / "folder", Focal)
 
 
 def test_the_state_directory_is_the_configured_or_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

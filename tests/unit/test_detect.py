@@ -436,5 +436,8 @@ def test_under_a_lamp_turns_are_neither_where_they_are_seen_nor_a_threshold_earl
         assert [name for name, *_ in found.focus.contributions] == ["vertex"]
         errors_um.append((found.focus_us - world.focus_us) * 1e-6 * 500.0)
         assert abs(errors_um[-1]) < found.sigma_us * 1e-6 * 500.0
+        if found.outcome is Outcome.FOCUSED:
+            known = cut(recorded(world), found.decided_us)
+            assert SweepSearch(known, ROI, Ruler.of_speed(500.0), depth_of_focus_um=DOF_UM).run() == found
     # The rebuilt image alone is 2 um early in the mean, the levels at the periods' ends are 4 um late.
     assert np.mean(np.abs(errors_um)) < 1.5
