@@ -211,11 +211,12 @@ class Passes:
     def lag_um(self) -> tuple[float, float]:
         """Return how well the first pass knows its lag, and focus but for what makes events late: standard errors, um.
 
-        The worst and the best of its witnesses. Without any: nothing, infinity.
+        The worst of its witnesses in both: where a lens meets two planes or noise drowns the scene, it is the pairs that
+        are scattered, while the image's top looks as sharp as ever. Without any: nothing, infinity.
         """
         said = self._said[0][0].witnesses if self._said else ()
         late = [one for one in said if one.shared > 0.0]
-        return max((one.shared for one in late), default=0.0), min((one.sigma for one in late), default=inf)
+        return max((one.shared for one in late), default=0.0), max((one.sigma for one in late), default=inf)
 
     def _of_one_lag(self) -> list[tuple[Witness, int]]:
         """Return all witnesses, each with the direction of its pass.

@@ -12,6 +12,7 @@ off, and what one pass tells of that hangs on which pixels are how dark. One way
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import TYPE_CHECKING
 
 from elpd.focus import judging, safety
@@ -70,7 +71,7 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
 def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
     """Say whether the lag alone may put a still scene's answer out of focus, and nothing else is in the way of one."""
     lag_um, but_for_it_um = watch.after.lag_um
-    clear = but_for_it_um <= judging.limit_um(settings) and not watch.after.depths_um
+    clear = but_for_it_um <= sqrt(2.0) * judging.limit_um(settings) and not watch.after.depths_um  # of two passes
     return clear and SIGMAS * lag_um > settings.depth_of_focus_um
 
 

@@ -102,7 +102,7 @@ def test_hot_pixels_are_left_out_and_counted(seed: int) -> None:
 
 @pytest.mark.parametrize(("seed", "apart_um"), [(2, 60.0), (3, 60.0)])
 def test_of_several_depths_the_first_met_is_taken_and_all_are_told(seed: int, apart_um: float) -> None:
-    slowly = ("lens.speed_um_s=2000", "sim.speed_um_s=2000")  # of several planes, pairs do not tell the lag
+    slowly = ("lens.speed_um_s=1500", "sim.speed_um_s=1500")  # of several planes, pairs do not tell the lag
     story = meet(seed, f"sim.second_plane_um={apart_um}", *slowly, request=MIDDLE, planes=True)
     assert story.outcome is Outcome.FOCUSED
     assert story.result is not None
