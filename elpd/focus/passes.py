@@ -211,8 +211,8 @@ class Passes:
     def lag_um(self) -> tuple[float, float]:
         """Return how well the first pass knows its lag, and focus but for what makes events late: standard errors, um.
 
-        The worst of its witnesses in both: where a lens meets two planes or noise drowns the scene, it is the pairs that
-        are scattered, while the image's top looks as sharp as ever. Without any: nothing, infinity.
+        The worst of its witnesses in both: where a lens meets two planes or noise drowns the scene, it is the pairs
+        that are scattered, while the image's top looks as sharp as ever. Without any: nothing, infinity.
         """
         said = self._said[0][0].witnesses if self._said else ()
         late = [one for one in said if one.shared > 0.0]
