@@ -6,8 +6,10 @@ of bright ones, and would be taken for lag:
 *Local contrast.* In log intensity the dark sides of edges turn sharply, and a lens whose blur before focus is another
 than behind it moves the midpoints of what turns gently: a wall of gravel without any lag has 3 um between its dark and
 its bright pixels. That goes with how dark a pixel is *beside its neighbours*, while lag goes with how dark it is at
-all. So the logarithm of slowness over that of the neighbourhood is a regressor of its own. Where a picture is evenly
-lit the two are one, and the lag's error says so.
+all. So the logarithm of slowness over that of the neighbourhood is a regressor of its own. But lag itself goes with
+local contrast too: out of focus a dark pixel has light of its neighbours and is not as slow as the picture in focus
+says. One pass cannot tell which it is, so the line is drawn both ways; the mean is taken, and half of the difference is
+in its error.
 
 *What is smooth in brightness* and none of both (surfaces, field curvature): no scatter shows it, so it comes as a
 standard deviation that was measured (``Turns.smooth``).
@@ -18,7 +20,7 @@ scatter of thousands of pairs over the root of their number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import TYPE_CHECKING
 
@@ -147,23 +149,34 @@ class Turns:
         blocks = np.unique(self.block[use])
         if use.size < FEWEST_PAIRS or blocks.size < FEWEST_BLOCKS or np.ptp(times) <= 1e-9 * float(times.max()):
             return None, slowness.times
-        one = _Regression(self.middle[use], self.weights[use], times, beyond)
+        thinned = replace(
+            self, middle=self.middle[use], gap=self.gap[use], weights=self.weights[use], block=self.block[use]
+        )
+        all_lag, apart = (thinned.drawn(times, one, blocks) for one in (np.zeros_like(beyond), beyond))
+        if all_lag is None or apart is None:
+            return None, slowness.times
+        slope, doubt = 0.5 * (all_lag.slope + apart.slope), 0.5 * (all_lag.slope - apart.slope)
+        sigma = float(np.hypot(max(all_lag.sigma, apart.sigma), doubt))
+        return replace(apart, slope=slope, sigma=sigma), lateness(slowness.times, self.gap, slope)
+
+    def drawn(self, times: NDArray[np.float64], beyond: NDArray[np.float64], blocks: NDArray[np.int64]) -> Line | None:
+        """Draw the line with what goes with local contrast (n,) put to lag, where *beyond* is zero, or taken apart."""
+        one = _Regression(self.middle, self.weights, times, beyond)
         found = one.fit(times, np.array([self.mode, 0.0, 0.0]), self.reach, _ROUNDS)
         late = times
         for _ in range(_BENDS):
-            late = lateness(times, self.gap[use], float(found.at[1]))
+            late = lateness(times, self.gap, float(found.at[1]))
             found = one.fit(late, found.at, found.cut, _AGAIN)
         if found.scatter > LEAST_ORDER * _RANDOM * self.reach or not found.weights.any():
-            return None, slowness.times  # pairs anywhere, or in heaps that no line goes through
-        variance = one.jackknife(late, found, self.block[use], blocks)
-        slope, kept = float(found.at[1]), found.weights
+            return None  # pairs anywhere, or in heaps that no line goes through
+        variance = one.jackknife(late, found, self.block, blocks)
+        kept = found.weights
         x = late - float(np.average(late, weights=kept))
         spread = float(np.average(x * x, weights=kept))
         sigma = sqrt(variance + self.smooth**2 / max(spread, 1e-24))
         many = float(kept.sum() ** 2 / np.square(kept).sum())
         alike = max(1.0, variance * spread * many / max(found.scatter**2, 1e-24))
-        line = Line(slope, max(sigma, 1e-12), found.scatter, many / alike)
-        return line, lateness(slowness.times, self.gap, slope)
+        return Line(float(found.at[1]), max(sigma, 1e-12), found.scatter, many / alike)
 
     def share(self, line: Line | None, late: NDArray[np.float64]) -> float:
         """Return the part of all weight about the mode, as ``Mode.share``, but for how a line spreads the midpoints."""

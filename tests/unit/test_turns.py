@@ -35,7 +35,7 @@ def test_the_error_of_a_line_is_true_where_objects_share_what_is_wrong_with_them
     assert 0.6 < float(np.sqrt(np.mean(np.square(errors)))) < 1.5
 
 
-def test_what_is_dark_beside_its_neighbours_does_not_pass_for_slow() -> None:
+def test_what_is_dark_beside_its_neighbours_may_be_slow_or_not() -> None:
     turns, slowness = turns_of_a_lag(0.15, contrast=2.0)
     line, _ = turns.line(slowness)
     fooled, _ = turns.line(Slowness(slowness.times, np.zeros_like(slowness.times)))
@@ -43,11 +43,12 @@ def test_what_is_dark_beside_its_neighbours_does_not_pass_for_slow() -> None:
     assert fooled is not None
     assert line.slope == pytest.approx(0.15, abs=3.0 * line.sigma)
     assert abs(fooled.slope - 0.15) > 5.0 * fooled.sigma
-    # In an evenly lit picture local contrast and slowness are one, and the error says so.
-    even = Slowness(slowness.times, np.log(slowness.times))
-    unknown, _ = turns.line(even)
-    assert unknown is not None
-    assert unknown.sigma > 2.0 * line.sigma
+    assert abs(line.slope - 0.15) < 0.6 * abs(fooled.slope - 0.15)
+    # Where local contrast does nothing both ways agree, and nothing is in doubt.
+    plain, same = turns_of_a_lag(0.15)
+    sure, _ = plain.line(same)
+    assert sure is not None
+    assert line.sigma > 2.0 * sure.sigma
 
 
 def test_slow_pixels_are_less_late_than_their_slowness_where_their_pairs_come_soon_after_focus() -> None:
