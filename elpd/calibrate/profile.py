@@ -190,9 +190,9 @@ def make_room(directory: Path, kind: type[Profile]) -> None:
         with suppress(OSError):  # what cannot be renamed cannot be written either
             path.replace(aside)
             _log.warning("profile set aside", path=str(aside), reason=str(error).partition("; ")[0])
+    there = next(one for one in (directory, *directory.absolute().parents) if one.exists())
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory):
+        with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
         raise UsageError(

@@ -54,6 +54,9 @@ _RANDOM = 0.74
 BIWEIGHT = 4.685
 """Tukey's constant: 95 % as efficient as least squares where errors are normal."""
 
+LEAST_CUT = 1e-3
+"""Where the biweight ends at the least, over how far pairs are asked: no midpoint is known better."""
+
 _BENDS = 4
 _ROUNDS = 12
 _AGAIN = 4
@@ -161,7 +164,7 @@ class Turns:
 
     def drawn(self, times: NDArray[np.float64], beyond: NDArray[np.float64], blocks: NDArray[np.int64]) -> Line | None:
         """Draw the line with what goes with local contrast (n,) put to lag, where *beyond* is zero, or taken apart."""
-        one = _Regression(self.middle, self.weights, times, beyond)
+        one = _Regression(self.middle, self.weights, times, beyond, LEAST_CUT * self.reach)
         found = one.fit(times, np.array([self.mode, 0.0, 0.0]), self.reach, _ROUNDS)
         late = times
         for _ in range(_BENDS):
@@ -197,7 +200,7 @@ class _Fit:
 
 
 class _Regression:
-    """Midpoints (n,) on a constant, on lateness, and on local contrast."""
+    """Midpoints (n,) on a constant, on lateness, and on local contrast; the biweight ends no closer than *least*."""
 
     def __init__(
         self,
@@ -205,8 +208,9 @@ class _Regression:
         weights: NDArray[np.float64],
         times: NDArray[np.float64],
         beyond: NDArray[np.float64],
+        least: float,
     ) -> None:
-        self._middle, self._weights = middle, weights
+        self._middle, self._weights, self._least = middle, weights, least
         centred = beyond - float(np.average(beyond, weights=weights))
         # What hardly differs tells nothing, and would only be a second constant.
         self._beyond = centred if np.ptp(centred) > 1e-6 else np.zeros_like(times)
@@ -225,7 +229,7 @@ class _Regression:
                 break
             inside = np.abs(residual) <= cut
             scatter = _median(np.abs(residual[inside]), self._weights[inside]) / 0.6745
-            cut = min(cut, max(BIWEIGHT * scatter, 1e-9 * cut))
+            cut = min(cut, max(BIWEIGHT * scatter, self._least))
         return _Fit(at, cut, kept, scatter)
 
     def jackknife(

