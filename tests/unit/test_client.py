@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 import subprocess
 import sys
 import threading
@@ -110,10 +111,14 @@ def test_ctrl_c_cancels_the_cycle(rig: Client, engine: FakeEngine) -> None:
         press_ctrl_c()
 
     presser = threading.Thread(target=press)
-    presser.start()
-    with pytest.raises(KeyboardInterrupt):
-        rig.focus()
-    presser.join()
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        presser.start()
+        with pytest.raises(KeyboardInterrupt):
+            rig.focus()
+        presser.join()
+    finally:
+        signal.signal(signal.SIGINT, previous)
     engine.heard(lambda: engine.accepted[0].answer is not None)
 
 
