@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from elpd.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
 INK, BLUE, RED, GREY = "#222222", "#1f5fa8", "#b23a2e", "#9a9a9a"
@@ -46,6 +47,15 @@ def nothing(axes: Any, title: str, why: str) -> None:
     axes.set_axis_off()
     words = textwrap.fill(why, LETTERS_A_LINE)
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", fontsize=8.5, color=INK)
+
+
+def both_ways(axes: Any, points: Iterable[tuple[float, float, float]]) -> None:
+    """Draw points (speed with its sign, value, error) over how fast, each direction in a colour of its own."""
+    of_all = list(points)
+    for sign, colour, word in ((1, BLUE, "up"), (-1, RED, "down")):
+        rows = [(abs(speed), value, error) for speed, value, error in of_all if speed * sign > 0]
+        speeds, values, errors = ([row[k] for row in rows] for k in range(3))
+        axes.errorbar(speeds, values, errors, fmt="o", color=colour, capsize=3, ms=4, label=word)
 
 
 def write(figure: Any, path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.calibrate.figure import BLUE, GREY, INK, RED, head, nothing, sheet, write
+from elpd.calibrate.figure import BLUE, GREY, INK, both_ways, head, nothing, sheet, write
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,18 +35,7 @@ def _ways(axes: Any, title: str, found: ModeFound | None) -> None:
     text = f"onset {found.onset_ms}\nfrom stop to stop {found.onset_scatter_ms}\nbraking {found.deceleration_sps2}"
     head(axes, title, text)
     onset_s, braking = 1e-3 * (found.onset_ms.value or 0.0), found.deceleration_sps2.value
-    for sign, colour, word in ((1, BLUE, "up"), (-1, RED, "down")):
-        rows = [one for one in found.ways if one.speed_sps * sign > 0]
-        axes.errorbar(
-            [abs(one.speed_sps) for one in rows],
-            [one.way_steps for one in rows],
-            [one.scatter_steps for one in rows],
-            fmt="o",
-            color=colour,
-            capsize=3,
-            ms=4,
-            label=word,
-        )
+    both_ways(axes, ((one.speed_sps, one.way_steps, one.scatter_steps) for one in found.ways))
     if found.ways:
         speed = np.linspace(0.0, max(abs(one.speed_sps) for one in found.ways), 100)
         ramp = 0.0 if braking is None else speed**2 / (2.0 * braking)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from elpd.calibrate.figure import BLUE, GREY, INK, RED, head, nothing, sheet, write
+from elpd.calibrate.figure import GREY, INK, both_ways, head, nothing, sheet, write
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,18 +21,7 @@ def draw_play(path: Path, found: BacklashCalibration) -> None:
         write(figure, path)
         return
     head(axes, "focus, by the motor's count", f"play {found.backlash_um}\nlate by {found.lag_us}")
-    for sign, colour, word in ((1, BLUE, "up"), (-1, RED, "down")):
-        rows = [one for one in found.readings if one.speed_um_s * sign > 0]
-        axes.errorbar(
-            [abs(one.speed_um_s) for one in rows],
-            [one.focus_um for one in rows],
-            [one.sigma_um for one in rows],
-            fmt="o",
-            color=colour,
-            capsize=3,
-            ms=4,
-            label=word,
-        )
+    both_ways(axes, ((one.speed_um_s, one.focus_um, one.sigma_um) for one in found.readings))
     play_um, lag_us = found.backlash_um.value, found.lag_us.value
     if play_um is not None and lag_us is not None:
         middle_um = sum(one.focus_um for one in found.readings) / len(found.readings)

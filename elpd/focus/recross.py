@@ -123,7 +123,7 @@ def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, 
     ramp_um = speed_um_s**2 / (2.0 * stage.to_um(limits.acceleration_sps2))
     beside_um = ramp_um + settings.backlash_um + APPROACH_MARGIN_UM
     reach_um, run_up_um = (dof * settings.depth_of_focus_um + doubt_um for dof in (REACH_DOF, RUN_UP_DOF))
-    begin_um = stage.within_limits_um(about_um - way * (run_up_um))
+    begin_um = stage.within_limits_um(about_um - way * run_up_um)
     end_um = stage.within_limits_um(about_um + way * (reach_um + beside_um))
     if way * (stage.here_um() - begin_um) > stage.um_per_step:
         watch.after.catch_up()
