@@ -28,13 +28,13 @@ export function mountTrend(open) {
       {
         width: place.clientWidth || 320,
         height: place.clientHeight || 150,
-        padding: [12, 14, 0, 0],
+        padding: [12, 10, 4, 0],
         legend: { show: false },
         cursor: { drag: { x: false, y: false }, points: { show: false }, y: false },
         scales: { x: { time: false, range: (_, low, high) => [low - 0.5, high + 0.5] }, y: { range: spanY } },
         axes: [
-          { ...axis, size: 26, gap: 4, grid: { show: false }, splits: ends, values: (_, splits) => splits.map((nth) => moment(shown.runs[nth]?.at)) },
-          { ...axis, size: 54, gap: 4, values: (_, values) => values.map((one, nth) => (nth === values.length - 1 ? `${one.toFixed(digits)} ${unit}` : one.toFixed(digits))) },
+          { show: false },
+          { ...axis, size: 68, gap: 4, values: (_, values) => values.map((one, nth) => (nth === values.length - 1 ? `${one.toFixed(digits)} ${unit}` : one.toFixed(digits))) },
         ],
         series: [{}, { paths: () => null, points: { show: true, size: 6, fill: ink("good"), stroke: ink("good"), width: 0 } }],
         hooks: { draw: [drawErrors, drawFailures], setCursor: [(self) => say($("trend-readout"), under(self))] },
@@ -42,11 +42,6 @@ export function mountTrend(open) {
       [shown.number, shown.good],
       place,
     );
-  }
-
-  function ends(self) {
-    const last = self.data[0].length - 1;
-    return last > 0 && self.bbox.width / devicePixelRatio > 260 ? [0, last] : [last];
   }
 
   function spanY(_, low, high) {
@@ -98,8 +93,10 @@ export function mountTrend(open) {
     shown = series(runs, measure());
     build();
     place.dataset.points = shown.good.filter((one) => one !== null).length;
+    say($("trend-from"), moment(shown.runs[0].at));
+    say($("trend-to"), moment(shown.runs.at(-1).at));
     const text = summary(runs, measure());
-    say($("trend-summary"), text);
+    say($("trend-summary"), shown.bad.some((one) => one !== null) ? `${text} Red: not in focus.` : text);
     place.ariaLabel = `${runs.length} runs, oldest first. ${text}`;
   }
 
