@@ -13,12 +13,13 @@ which closes its last windows.
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from elpd.errors import CameraError, ConfigError
+from elpd.errors import CameraError, ConfigError, FormatError
 from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.evt2 import HIGH_BITS, LOW_BITS
 from elpd.events.layout import event_columns
@@ -35,8 +36,23 @@ if TYPE_CHECKING:
     from elpd.records import Frame, ImuSample, Trigger
 
 PIECE_BYTES = 1 << 20
+PEEK_BYTES = 1 << 12
 DEFAULT_PACKET_US = 1000
 FOREVER_US = 1 << 62
+
+
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how packets may be encoded: as the recording's first is; any, where there is none to see."""
+    try:
+        reader = open_recording(Path(settings["path"]))
+    except (KeyError, FormatError):
+        return frozenset(Encoding)
+    try:
+        return frozenset(packet.encoding for packet in islice(reader.packets(PEEK_BYTES), 1)) or frozenset(Encoding)
+    except FormatError:
+        return frozenset(Encoding)
+    finally:
+        reader.close()
 
 
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> EventCamera:
