@@ -39,6 +39,7 @@ RATIOS = {
     "fused_simd_vs_paper_loop": ("elpd fused simd", LOOP),
     "fused_simd_vs_fused_scalar": ("elpd fused simd", "elpd fused scalar"),
     "fused_simd_vs_memcpy": ("elpd fused simd", "memcpy"),
+    "first_events_vs_decoded": ("elpd first events", "elpd first events, decoded"),
 }
 PER_EVENT = {"arrays_vs_best_peer_decode": ("elpd arrays to ELP", "best peer")}
 """Ratios of events, not of bytes, per second: the contenders read different encodings."""
