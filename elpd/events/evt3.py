@@ -190,9 +190,9 @@ def decode(  # noqa: C901  (one function: calls cost)
     t = (loop << 24) + (high << 12) + low
     x_limit = width if row < height else 0
     room = out_t.shape[0] - EVENTS_PER_WORD
-    n = 0
-    y_out = 0
-    x_out = 0
+    n: Integer = 0
+    y_out: Integer = 0
+    x_out: Integer = 0
     i = np.uint64(position)
     size = np.uint64(words.shape[0])
     while i < size and n <= room:
@@ -274,4 +274,4 @@ def decode(  # noqa: C901  (one function: calls cost)
     state[EVENTS] += n
     state[Y_OUT_OF_RANGE] += y_out
     state[X_OUT_OF_RANGE] += x_out
-    return int(i), n
+    return int(i), int(n)
