@@ -16,7 +16,7 @@ What edges of one direction depart from those of another is taken off before (``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -98,7 +98,7 @@ class BandFocus:
     departure: float
     scatter: float
     as_blur: bool = True
-    astigmatism: Astigmatism | None = None
+    astigmatism: Astigmatism | None = field(default=None, compare=False)
 
     def mirrored(self, sign: float) -> BandFocus:
         """Return the same on a ruler that runs the other way, where *sign* is -1."""
@@ -113,10 +113,13 @@ def focus_of_bands(
     half_width: float,
     bands: int = len(BANDS_PX),
     edges: Sequence[Edges] | None = None,
+    *,
+    of_events: bool = False,
 ) -> BandFocus | None:
     """Fit each band's parabola, (points, bands), and the focus behind them; ``None`` if the finest has no peak.
 
-    No more than the *bands* finest ones are believed. *edges* are those of the images at each point.
+    No more than the *bands* finest ones are believed. *edges* are those of the images at each point,
+    which *of_events* says that events built.
     """
     raw = [fit_vertex(position, log_energies[:, band], half_width) for band in range(len(BANDS_PX))]
     finest = with_window(raw[0], position, log_energies[:, 0], half_width)
@@ -125,7 +128,7 @@ def focus_of_bands(
     scatter = float(np.hypot(raw[0].sigma, raw[0].sigma if raw[1] is None else raw[1].sigma))
     rise = log_energies[int(np.argmax(log_energies[:, 0]))] - log_energies[0]
     as_blur = bool(rise[1] < rise[0]) and (raw[1] is None or raw[1].width > raw[0].width)
-    tilt = None if edges is None else find_astigmatism(position, edges, half_width, finest.width)
+    tilt = None if edges is None else find_astigmatism(position, edges, half_width, finest.width, of_events=of_events)
     shifts = [(0.0, 0.0)] * len(BANDS_PX) if tilt is None else [tilt.shift(one) for one in tilt.towards]
     bound = DEPARTURE * finest.width
     normal, right, squares, count = np.diag([0.0, 1.0 / bound**2]), np.zeros(2), 0.0, 0

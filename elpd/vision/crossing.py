@@ -168,7 +168,7 @@ def ask_events(
         # Edges that move make mirrors wherever they go, those of bright pixels at other times than those of dark ones.
         lag, pairs_lag = expected, late.unasked
         pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - pairs_lag.at)
-    elif pairs is not None and image is not None and image.astigmatism is not None:
+    if pairs is not None and image is not None and image.astigmatism is not None:
         shift, sigma = image.astigmatism.shift(late.towards)
         pairs = replace(pairs, at=pairs.at - shift, sigma=float(np.hypot(pairs.sigma, sigma)))
     return EventWitnesses(
@@ -201,7 +201,7 @@ def _sharpest(
     # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
     # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
     below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
-    edges = None if drift.seen else [edges_of(image, light.weight, events.margin) for image in images]
+    edges = [edges_of(image, light.weight, events.margin) for image in images]
     bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(light.worths) * [below]]
     curves = quiet if still else loud if drift.seen else loud + quiet
     candidates = [

@@ -93,7 +93,7 @@ def image_focus(
     if int(use.sum()) < 5:
         return None
     edges = None if edges is None else edges[: int(use.sum())]
-    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands, edges)
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands, edges, of_events=True)
     if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
         return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.

@@ -33,22 +33,19 @@ ORDER = 5
 
 KEPT = 512
 MIN_INTERVALS = 5_000
-MAX_PERIOD_US = 5_000.0
-"""Beyond this nobody sets it for focusing, and a shortest interval so long only says that there are few events."""
-
 GRID_COUNT = 250
 """So many intervals exactly alike and shortest, and the time stamps are on a grid too, whatever most of them do."""
 
-EVEN_OVER = 69
 FEWEST_ABOVE = 8
 EVEN_SIGMAS = 2.0
-"""So many intervals above the shortest are looked at, and must not crowd towards their end by so many deviations."""
+"""So many intervals must lie above the shortest, up to half as long again, and not crowd towards their end by so many
+standard deviations. One steep edge makes several alike at the start, so all that are kept are looked at."""
 
 TOGETHER_US = 16.0
 """Closer together than this all of them are at the period, and whole microseconds say nothing of how they lie."""
 
 MOST_US = 1_000.0
-"""So long a period nobody sets for focusing: a bound above it says nothing more."""
+"""So long a period nobody sets for focusing: shortest intervals above it are those of the scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +105,12 @@ def refractory_period(
     least_us = float(shortest_us[ORDER - 1])
     bound_us = min(least_us, MOST_US)
     only_bounded = Refractory(0.5 * bound_us, bound_us / sqrt(12.0))
-    if count < MIN_INTERVALS or least_us > MAX_PERIOD_US or shortest_us[0] == shortest_us[GRID_COUNT]:
+    if count < MIN_INTERVALS or least_us > MOST_US or shortest_us[0] == shortest_us[GRID_COUNT]:
         return only_bounded
     top_us = min(1.5 * least_us, float(shortest_us[-1]))
-    above = (shortest_us[ORDER:EVEN_OVER] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
+    above = (shortest_us[ORDER:] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
     above = above[: max(FEWEST_ABOVE, int(np.searchsorted(above, 1.0, side="right")))]
-    if above.size < FEWEST_ABOVE or _on_a_grid(shortest_us[:EVEN_OVER], t_us):
+    if above.size < FEWEST_ABOVE or _on_a_grid(shortest_us, t_us):
         return only_bounded
     # Evenly spread, they lie at half their range on average; what is set by edges in view crowds towards its end.
     reach = max(float(above.max()), 1.0 / (top_us - least_us))
