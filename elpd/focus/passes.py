@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
+    from elpd.vision.track import Sharpness
     from elpd.vision.witness import EventWitnesses, Witness
 
 PATH_STEP_US = 250
@@ -67,7 +68,7 @@ class Pass:
     """One stretch of motion over focus: what was seen, when it began and was over, which way and how fast it went."""
 
     memory: EventMemory
-    frames: Sequence[tuple[SensorUs, NDArray[np.float64]]]
+    frames: Sequence[tuple[SensorUs, Sharpness]]
     """Each frame's time and log S in each band."""
     begun_us: SensorUs
     end_us: SensorUs
@@ -250,14 +251,14 @@ class Passes:
         )
 
 
-def _track_of(points: Sequence[tuple[int, float, NDArray[np.float64]]]) -> PeakTrack:
+def _track_of(points: Sequence[tuple[int, float, Sharpness]]) -> PeakTrack:
     track = PeakTrack()
     for point in points:
-        track.add_bands(*point)
+        track.add_sharpness(*point)
     return track
 
 
-def _jackknife(points: Sequence[tuple[int, float, NDArray[np.float64]]]) -> float:
+def _jackknife(points: Sequence[tuple[int, float, Sharpness]]) -> float:
     """Return the frames' standard error by leaving each point out in turn; infinite where one point carries it all.
 
     What motion does to a few frames is not scatter about a parabola: three points always lie on one.

@@ -192,7 +192,7 @@ class SweepSearch:
         if t_us < self._begin_us:
             return None
         exposed = self._ruler.position(t_us - self._sweep.frame_age_us)
-        self._frames.add_bands(t_us, exposed, self._frame_energy.measure(pixels))
+        self._frames.add_sharpness(t_us, exposed, self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 

@@ -6,12 +6,13 @@ drawn from frames (the sharpest witness where there are any) and from the image 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from elpd.vision.astigmatism import Edges, edges_of
 from elpd.vision.bands import band_energies, focus_of_bands
 from elpd.vision.drift import shift_px
 from elpd.vision.integral import (
@@ -55,6 +56,14 @@ POINT = np.ones((1, 1), np.float32)
 _FLOOR = 1e-12
 
 
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """What a frame shows: log S in each band, (bands,), and where its edges point."""
+
+    bands: NDArray[np.float64]
+    edges: Edges | None = None
+
+
 class PeakTrack:
     """A growing curve of (position, log S)."""
 
@@ -62,15 +71,15 @@ class PeakTrack:
         self.times_us: list[int] = []
         self.positions: list[float] = []
         self.values: list[float] = []
-        self._bands: list[NDArray[np.float64]] = []
+        self._sharpness: list[Sharpness] = []
         self._peak = 0
         self._lowest_before_peak = float("inf")
         self._lowest = float("inf")
 
-    def add_bands(self, t_us: int, position: float, bands: NDArray[np.float64]) -> None:
+    def add_sharpness(self, t_us: int, position: float, sharpness: Sharpness) -> None:
         """Append a point of which all bands are known: the finest is the curve, all of them tell the focus."""
-        self._bands.append(bands)
-        self.add(t_us, position, float(bands[0]))
+        self._sharpness.append(sharpness)
+        self.add(t_us, position, float(sharpness.bands[0]))
 
     def add(self, t_us: int, position: float, value: float) -> None:
         """Append a point; times rise."""
@@ -158,16 +167,22 @@ class PeakTrack:
 
     def focus(self) -> BandFocus | None:
         """Return the focus of parabolas through what lies within ``FIT_DROP`` of the peak, of points with all bands."""
-        if len(self._bands) != len(self) or len(self) < 3:
+        if len(self._sharpness) != len(self) or len(self) < 3:
             return None
         begin = self.flank(2.0 * FIT_DROP)
         z = np.array(self.positions[begin:])
-        bands = np.array(self._bands[begin:])
+        bands = np.array([one.bands for one in self._sharpness[begin:]])
+        edges = [one.edges for one in self._sharpness[begin:] if one.edges is not None]
         sign = -1.0 if z[-1] < z[0] else 1.0
         wide = fit_vertex(sign * z, bands[:, 0], float(np.ptp(z)))
         if wide is None:
             return None
-        found = focus_of_bands(sign * z, bands, wide.width * float(np.sqrt(2.0 * FIT_DROP)))
+        found = focus_of_bands(
+            sign * z,
+            bands,
+            wide.width * float(np.sqrt(2.0 * FIT_DROP)),
+            edges=edges if len(edges) == z.size else None,
+        )
         return None if found is None else found.mirrored(sign)
 
 
@@ -193,8 +208,8 @@ class FrameEnergy:
         self._before: NDArray[np.float32] | None = None
         self._shift_px = np.zeros(2)
 
-    def measure(self, pixels: NDArray[np.generic]) -> NDArray[np.float64]:
-        """Return log S of a frame, 8 or 16 bit, in each band."""
+    def measure(self, pixels: NDArray[np.generic]) -> Sharpness:
+        """Return log S of a frame, 8 or 16 bit, in each band, and where its edges point."""
         roi, margin = self._roi, self._margin
         top, left = max(0, roi.y - margin), max(0, roi.x - margin)
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
@@ -205,8 +220,8 @@ class FrameEnergy:
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
         levels = np.log(image + np.float32(FRAME_GROUND))
-        energies = band_energies(levels, weight * self._moved(inside, levels))
-        return np.asarray(np.log(energies + _FLOOR))
+        weight = weight * self._moved(inside, levels)
+        return Sharpness(np.log(band_energies(levels, weight) + _FLOOR), edges_of(levels, weight))
 
     def _moved(self, inside: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the region's mask where its scene has gone to."""

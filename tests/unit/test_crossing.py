@@ -21,7 +21,7 @@ from elpd.vision.integral import (
     rebuild_levels,
     stamp_events,
 )
-from elpd.vision.track import EventEnergy, PeakTrack
+from elpd.vision.track import EventEnergy, PeakTrack, Sharpness
 from elpd.vision.witness import Witness, frame_witness, fuse
 
 
@@ -202,7 +202,7 @@ def test_candidates_are_averaged_by_how_well_they_are_parabolas() -> None:
 def drawn(values: Any) -> Any:
     track = PeakTrack()
     for k, value in enumerate(values):
-        track.add_bands(1000 * k, float(k), np.full(len(BANDS_PX), float(value)))
+        track.add_sharpness(1000 * k, float(k), Sharpness(np.full(len(BANDS_PX), float(value))))
     return track
 
 
@@ -225,5 +225,5 @@ def test_a_curve_that_only_falls_or_only_rises_has_not_peaked() -> None:
 def test_a_falling_position_gives_the_same_vertex() -> None:
     track = PeakTrack()
     for k in range(60):
-        track.add_bands(1000 * k, 100.0 - k, np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0))
+        track.add_sharpness(1000 * k, 100.0 - k, Sharpness(np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0)))
     assert track.focus().at == pytest.approx(60.0)
