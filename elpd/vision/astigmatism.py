@@ -46,6 +46,10 @@ through the lens's four fields have 0.01 to 0.02, in violent motion 0.03."""
 LEAST_SIGMA = 0.005
 """Standard error of a wedge's vertex at the least, in widths, as of a band's."""
 
+HELD_BACK = 0.15
+"""Error of a wedge's vertex, in widths, over the noise in it relative to its picture, as of whole bands
+(``witness.HELD_BACK``): what pixels hold back is not quite white. Bars have nothing but that in three wedges of four."""
+
 TAPER_PX = 4.0
 """The region fades out over its border, so that its frame has no edges of its own."""
 
@@ -62,11 +66,12 @@ class Edges:
     """What an image has of edges of each direction.
 
     ``energy`` (bands, wedges), freed of white noise; ``towards`` (bands, wedges, 2), the mean of cos 2θ and sin 2θ over
-    it, θ the direction across the edge from x to y.
+    it, θ the direction across the edge from x to y; ``noise`` (bands, wedges), what was taken off over what is left.
     """
 
     energy: NDArray[np.float64]
     towards: NDArray[np.float64]
+    noise: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +165,7 @@ def edges_of(image: NDArray[np.float32], weight: NDArray[np.float32], margin: in
     raw, energy = (np.tensordot(one, polar.response[..., 0], 1) for one in (summed, pure))
     freed = np.asarray(np.maximum(energy, _FLOOR * raw + 1e-12), dtype=np.float64)
     towards = np.tensordot(np.maximum(pure, 0.0), polar.response, 1)
-    return Edges(freed, towards[..., 1:] / np.maximum(towards[..., :1], 1e-12))
+    return Edges(freed, towards[..., 1:] / np.maximum(towards[..., :1], 1e-12), (raw - energy) / freed)
 
 
 def find_astigmatism(
@@ -202,7 +207,8 @@ def find_astigmatism(
             rows.append(row)
             places.append(vertex.at)
             # As of a whole band: what is coarse has little structure, and tilts move wide curves the most.
-            errors.append(max(vertex.sigma, LEAST_SIGMA * width) * max(1.0, vertex.width / width) ** 3)
+            own = max(vertex.sigma, LEAST_SIGMA * width) * max(1.0, vertex.width / width) ** 3
+            errors.append(float(np.hypot(own, HELD_BACK * edges[top].noise[band, wedge] * width)))
     unexplained, unseen = (UNEXPLAINED_OF_EVENTS, BUILT_BY_EVENTS) if of_events else (UNEXPLAINED, 0.0)
     known, right = _marginal(np.array(rows).reshape(-1, bands + 2), np.array(places), np.array(errors), bands)
     # What no scatter shows makes the measurement less: (J⁻¹ + s²)⁻¹ in place of J. Then what was known before comes in.

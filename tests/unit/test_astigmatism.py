@@ -20,6 +20,7 @@ SIDE = 128
 WIDTH_UM = 60.0
 PLACES_UM = np.linspace(-45.0, 45.0, 19)
 ONES = np.ones((SIDE, SIDE), np.float32)
+NOTHING = np.zeros((len(BANDS_PX), WEDGES))
 
 
 def textured(seed: int, stretch: float) -> NDArray[np.float32]:
@@ -76,6 +77,32 @@ def test_one_direction_alone_tells_nothing_and_its_error_says_so() -> None:
     assert abs(freed.at) < 3.0 * freed.sigma
 
 
+def test_wedges_of_noise_have_no_say() -> None:
+    """Of bars, three wedges hold what pixels hold back and nothing else, and that has a peak somewhere too."""
+    places_um = np.arange(-20.0, 21.0, 2.0)
+    directions_of_wedges = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    towards = np.broadcast_to(directions_of_wedges, (*NOTHING.shape, 2))
+
+    def found(noise: float) -> Astigmatism:
+        sharpest_um = np.array([0.0, -12.0, -12.0, -12.0])  # by wedge
+        share = np.array([100.0, 1.0, 1.0, 1.0])
+        edges = [
+            Edges(
+                np.broadcast_to(share * np.exp(-0.5 * np.square((z_um - sharpest_um) / 40.0)), NOTHING.shape),
+                towards,
+                NOTHING + noise * np.array([0.0, 1.0, 1.0, 1.0]),
+            )
+            for z_um in places_um
+        ]
+        return find_astigmatism(places_um, edges, 15.0, 40.0)
+
+    along = np.array([1.0, 0.0])
+    assert found(0.0).shift(along)[0] > 4.0, "edges that are there are believed"
+    shift, sigma = found(5.0).shift(along)
+    assert abs(shift) < 1.0
+    assert sigma > 1.5
+
+
 def test_wedges_share_out_what_a_band_has_and_white_noise_has_none() -> None:
     picture = textured(4, 1.5)
     noise = np.random.default_rng(5).standard_normal(picture.shape).astype(np.float32)
@@ -108,8 +135,6 @@ def test_a_ruler_that_runs_the_other_way_has_the_same_lens() -> None:
 
 
 def test_without_a_peak_in_any_wedge_nothing_is_taken_off() -> None:
-    rising = [
-        Edges(np.full((len(BANDS_PX), WEDGES), np.exp(0.1 * k)), np.zeros((len(BANDS_PX), WEDGES, 2))) for k in range(9)
-    ]
+    rising = [Edges(np.full(NOTHING.shape, np.exp(0.1 * k)), np.zeros((*NOTHING.shape, 2)), NOTHING) for k in range(9)]
     found = find_astigmatism(np.arange(9.0), rising, 4.0, 10.0)
     assert found.shift(np.array([1.0, 0.0])) == pytest.approx((0.0, 0.5))
