@@ -52,6 +52,8 @@ class WatchSettings:
     """Between motor and carriage."""
     frames: bool = False
     """Whether the reference is a frame, whose bright and dark are blurred, and not a temporal map."""
+    background_activity_us: int = 0
+    """Events of a sweep that no neighbour fired so shortly before are not heard; 0: all are."""
 
 
 class Aftermath:

@@ -216,6 +216,7 @@ class FocusCycle:
                 settings.depth_of_focus_um,
                 Play.up_to(settings.backlash_um),
                 frames=picture.map is None,
+                background_activity_us=settings.background_activity_us,
             ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),

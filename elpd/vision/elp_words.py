@@ -3,7 +3,8 @@
 Each kernel comes in two builds from one body: plain, and with a causal per-pixel leaky rate cap that keeps a hot
 pixel from speaking for the scene. The cap is a leaky bucket in integer arithmetic: a pixel may have ``CAP_EVENTS``
 within ``CAP_US``, refilled one each ``CAP_US / CAP_EVENTS``; an event beyond is refused, counted, and does not fill
-the bucket.
+the bucket. With it goes, where it is wanted, a filter of background activity (``elpd.vision.background``). Both are
+asked about events inside the region alone.
 
 Decoding is bound by mispredicted branches, look-ups by the latency of a table that no level-2 cache holds. So they
 are kept apart: a block of words leaves its events' table indexes in a small buffer that stays in the level-1 cache,
@@ -25,6 +26,7 @@ from elpd.events.jit import kernel
 from elpd.events.lanes import four_words
 from elpd.events.registers import HIGH, LOOP, LOW, MAX_SIDE, ROW, VECTOR_ON, VECTOR_X, Integer
 from elpd.records import Encoding
+from elpd.vision.background import CELL, is_alone
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import (
     BEGIN,
@@ -34,6 +36,7 @@ from elpd.vision.elp_windows import (
     N_CAPPED,
     N_OFF,
     N_ON,
+    NEVER,
     OUT_OF_SENSOR,
     OUTSIDE,
     move_to,
@@ -93,6 +96,18 @@ def sum_pending(pending: NDArray[np.uint32], n: Integer, table: NDArray[np.int16
     window[OUT_OF_SENSOR] += out_of_sensor
 
 
+def new_buckets(size: int, support_us: int = 0) -> NDArray[np.int64]:
+    """Return what ``sum_capped`` remembers of a table of *size* entries: a bucket each.
+
+    Behind those, if *support_us* is not zero, lie that number and the cells of the filter of background activity.
+    """
+    buckets = np.full(size, NEVER, np.int64)
+    if support_us == 0:
+        return buckets
+    cells = (size // STRIDE // CELL + 1) * (STRIDE // CELL)
+    return np.concatenate((buckets, [support_us], np.full(cells, NEVER, np.int64)))
+
+
 @kernel()
 def sum_capped(
     pending: NDArray[np.uint32],
@@ -109,8 +124,11 @@ def sum_capped(
     Event i was at ``base_us + times[first + i]``. The buckets of a sensor are larger than any cache that is near, so
     they are all asked for first: without that an event took 18 ns on a dense recording, and 6 with.
     """
+    support_us = bucket[table.shape[0]] if bucket.shape[0] > table.shape[0] else np.int64(0)
     for i in range(n):
         prefetch(bucket, np.uint64(pending[i] >> np.uint32(1)))
+        if support_us > 0:
+            prefetch(bucket, _cell_of(pending[i] >> np.uint32(1), table.shape[0]))
     elp = np.int64(0)
     energy = np.int64(0)
     n_inside = np.int64(0)
@@ -129,6 +147,12 @@ def sum_capped(
             n_capped += 1
             continue
         bucket[index] = ready + REFILL_US
+        if support_us > 0:
+            row, column = np.uint32(index) // np.uint32(STRIDE), np.uint32(index) % np.uint32(STRIDE)
+            place = np.int64(row % np.uint32(CELL) * np.uint32(CELL) + column % np.uint32(CELL))
+            if is_alone(t, place, bucket, _cell_of(np.uint32(index), table.shape[0]), support_us):
+                n_capped += 1
+                continue
         on = np.int64(pending[i] & np.uint32(1))
         elp += (weight ^ -on) + on
         energy += weight * weight
@@ -139,6 +163,14 @@ def sum_capped(
     window[N_ON] += n_on
     window[N_OFF] += n_inside - n_on
     window[N_CAPPED] += n_capped
+
+
+@kernel()
+def _cell_of(index: Any, size: int) -> Any:
+    """Return where in the buckets of a table of *size* entries the cell of one of them (a ``uint32``) is."""
+    row, column = index // np.uint32(STRIDE), index % np.uint32(STRIDE)
+    cell = row // np.uint32(CELL) * np.uint32(STRIDE // CELL) + column // np.uint32(CELL)
+    return np.uint64(size + 1) + np.uint64(cell)
 
 
 @kernel()

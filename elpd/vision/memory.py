@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.vision.background import BackgroundActivity
 from elpd.vision.crossing import LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
@@ -76,6 +77,8 @@ class EventMemory:
         What a calibration knows: hot pixels are not heard, the lag is not guessed.
     start:
         The image that earlier events have built, upon which these go on building.
+    support_us:
+        Events that no other pixel of their cell fired so shortly before are not heard; 0: all are.
     """
 
     def __init__(
@@ -86,12 +89,16 @@ class EventMemory:
         hot: NDArray[np.bool_] | None = None,
         sensor: SensorProfile | None = None,
         start: BuiltImage | None = None,
+        support_us: int = 0,
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         height, width = self._bottom - self._top, self._right - self._left
         self._cap = PixelCap(height, width)
+        self._background = (
+            BackgroundActivity(height, width, support_us, left=self._left, top=self._top) if support_us else None
+        )
         self._sensor = sensor
         for x, y in sensor.hot_pixels if sensor is not None else ():
             if self._left <= x < self._right and self._top <= y < self._bottom:
@@ -120,6 +127,8 @@ class EventMemory:
         x = (x[inside] - self._left).astype(np.uint16)
         y = (y[inside] - self._top).astype(np.uint16)
         keep = self._cap.keep(t_us, x, y)
+        if self._background is not None:
+            keep[keep] = self._background.keep(t_us[keep], x[keep], y[keep])
         self.capped += int(keep.size - keep.sum())
         count = int(keep.sum())
         self._make_room(count)
