@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -42,11 +43,28 @@ class Epoch:
     later_s: float = 0.0
     lessons: Lessons = field(default_factory=Lessons)
     reports: list[LensReport] = field(default_factory=list)
+    phase: complex = 0j
+    phases: int = 0
 
     def forget_lessons(self, pace_sigma: float) -> None:
         """Go back to what was supposed before any report."""
         delay = (self.nominal_ns - self.start_ns) / NS_PER_S
         self.lessons = Lessons.supposed(self.variance, delay, self.delay_sigma_s, pace_sigma)
+        self.phase, self.phases = 0j, 0
+
+    def note_phase(self, steps: float, velocity_sps: float, quantum_steps: float) -> None:
+        """Note where between two positions that can be told one was told, in motion."""
+        if velocity_sps and quantum_steps:
+            self.phase += cmath.exp(2j * math.pi * (steps % quantum_steps) / quantum_steps)
+            self.phases += 1
+
+    def alike(self) -> float:
+        """Return which share of a rounding error's variance its reports have in common.
+
+        All of it where each was rounded at the same place between two positions, and one over their number where they
+        were rounded anywhere: the square of the mean of the places, taken as directions.
+        """
+        return abs(self.phase / self.phases) ** 2 if self.phases else 1.0
 
     def depends(self, when_ns: int) -> tuple[float, float, Sensitivity]:
         """Return position, velocity, and how the position depends on what is learnt."""

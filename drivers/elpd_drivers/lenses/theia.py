@@ -86,7 +86,7 @@ class TheiaSettings:
     late_ms: float = 500.0
     position_file: str = ""
     latency_us: float = 300.0
-    latency_sigma_us: float = 120.0
+    latency_sigma_us: float = 87.0
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> TheiaLens:
@@ -105,7 +105,7 @@ class TheiaLens:
         self.limits: LensLimits = _limits(settings)
         self._sigma_ns = round(settings.latency_sigma_us * NS_PER_US)
         self._latency_ns = round(settings.latency_us * NS_PER_US)
-        self._motor = Motor(Timing(self._latency_ns, self._sigma_ns, self._sigma_ns // 2, 2.0, ramp_steps=1.0))
+        self._motor = Motor(Timing(self._latency_ns, self._sigma_ns, 2.0, ramp_steps=1.0))
         self._asking = Asking(settings.query_ms, settings.reply_ms)
         self._replies = wire.ReplyReader()
         self._asked_ns = 0

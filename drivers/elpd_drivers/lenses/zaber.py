@@ -68,7 +68,7 @@ class ZaberSettings:
     query_ms: float = 6.0
     reply_ms: float = 60.0
     latency_us: float = 300.0
-    latency_sigma_us: float = 120.0
+    latency_sigma_us: float = 87.0
     iris_axis: int | None = None
     iris_closed: int = 0
     iris_open: int = 0
@@ -84,7 +84,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
     def build(table: ZaberSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
         # whether a count in motion is rounded or the last step is not documented: it may be either
-        timing = Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns // 2, quantum_steps=2.0, ramp_steps=0.3)
+        timing = Timing(latency.usual_ns, latency.sigma_ns, quantum_steps=2.0, ramp_steps=0.3)
         motor = Motor(timing)
         controller = ZaberController(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms)
