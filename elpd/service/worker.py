@@ -105,7 +105,7 @@ class Worker:
             self._run(job, parts)
             return
         self._idle.every_s = self._autopilot.listen_every_s
-        self._idle.somebody_watches = self._autopilot.mode == "continuous" or self._watched()
+        self._idle.somebody_watches = self._autopilot.weighs or self._watched()
         try:
             self._idle.turn(parts, needs_home=self._keeper.needs_home)
         except DeviceError as error:
