@@ -230,6 +230,7 @@ class FocusCycle:
             self._stage.wait_ms(LISTEN_MS)
         self._stage.hear(safety.CAMERA_SILENCE_MS)
         watch.armed()
+        self._stage.lost_at_rest = self._stage.lost_events
         self._guard(watch)
         return watch
 
