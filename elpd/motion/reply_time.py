@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 
+from elpd.motion.truncated import truncated
 from elpd.units import NS_PER_S
 
 SUPPOSED = 4.0
@@ -88,16 +89,4 @@ class ReplyTime:
         variance = min(max(self._whole - self._chance, self._weight**-0.5), self._whole)
         # a scatter of that standard deviation, evenly spread, reaches sqrt(3) of it below its mean
         longest_s = self._quickest_s[-1] + math.sqrt(3 * self._chance)
-        return _cut(self._supposed_s, math.sqrt(variance), 0.0, longest_s)
-
-
-def _cut(mean: float, sigma: float, low: float, high: float) -> tuple[float, float]:
-    """Return mean and standard deviation of a normal distribution between two bounds."""
-    a, b = (low - mean) / sigma, (high - mean) / sigma
-    inside = (math.erf(b / math.sqrt(2)) - math.erf(a / math.sqrt(2))) / 2
-    if inside < 1e-6:  # supposed far outside: nothing but the bounds is left
-        return (low + high) / 2, (high - low) / math.sqrt(12)
-    at_a, at_b = (math.exp(-0.5 * x * x) / math.sqrt(2 * math.pi) for x in (a, min(b, 40.0)))
-    shift = (at_a - at_b) / inside
-    spread = 1.0 + (a * at_a - min(b, 40.0) * at_b) / inside - shift * shift
-    return mean + sigma * shift, sigma * math.sqrt(max(spread, 0.0))
+        return truncated(self._supposed_s, math.sqrt(variance), 0.0, longest_s)

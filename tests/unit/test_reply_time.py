@@ -8,8 +8,9 @@ from elpd_drivers.sim.world import random_stream
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elpd.motion.commanded import REST
+from elpd.motion.commanded import Motion
 from elpd.motion.epoch import Epoch
+from elpd.motion.kinematics import Knot
 from elpd.motion.reply_time import ReplyTime
 
 VELOCITY_SPS = 12_800.0
@@ -83,17 +84,18 @@ def test_the_shared_delay_is_a_normal_one_cut_off(quickest_us: float, usual_us: 
     assert learnt.usual_ns / 1000 == pytest.approx(mean_us, abs=0.11 * spread_us)
 
 
-def epoch_told_at(steps: list[float]) -> Epoch:
-    epoch = Epoch(0, 0, REST, 0.0)
-    for one in steps:
-        epoch.note_phase(one, VELOCITY_SPS, 3.2)
-    return epoch
+def shared_by(times_ns: list[int]) -> float:
+    """Return which share of a rounding error reports at those times share, of a motor that makes 3.2 steps per ms."""
+    epoch = Epoch(0, 0, Motion(1e6, 3200.0), 0.0)
+    epoch.path = epoch.further = [Knot(0, 0.4, 3200.0, 0.0)]
+    epoch.note_places(times_ns, 3.2)
+    return epoch.alike
 
 
 def test_a_rounding_is_shared_as_far_as_places_between_two_positions_are_alike() -> None:
     draw = random_stream(5, "places")
-    assert epoch_told_at([]).alike() == 1.0
-    assert epoch_told_at([0.4 + 3.2 * n for n in range(50)]).alike() == pytest.approx(1.0)
-    assert epoch_told_at([1.6 * n for n in range(50)]).alike() == pytest.approx(0.0, abs=1e-9)
-    scattered = [epoch_told_at(list(draw.uniform(0, 1000, 25))).alike() for _ in range(400)]
+    assert shared_by([]) == 1.0
+    assert shared_by([1_000_000 * n for n in range(50)]) == pytest.approx(1.0)
+    assert shared_by([500_000 * n for n in range(50)]) == pytest.approx(0.0, abs=1e-9)
+    scattered = [shared_by([int(at) for at in draw.uniform(0, 1e9, 25)]) for _ in range(400)]
     assert np.mean(scattered) == pytest.approx(1 / 25, rel=0.2)
