@@ -48,7 +48,7 @@ LEAST_SIGMA = 0.005
 
 HELD_BACK = 0.15
 """Error of a wedge's vertex, in widths, over the noise in it relative to its picture, as of whole bands
-(``witness.HELD_BACK``): what pixels hold back is not quite white. Bars have nothing else in three wedges of four."""
+(``witness.HELD_BACK``): what pixels hold back is not quite white. Bars have only that in three wedges of four."""
 
 TAPER_PX = 4.0
 """The region fades out over its border, so that its frame has no edges of its own."""

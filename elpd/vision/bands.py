@@ -43,7 +43,9 @@ UNEXPLAINED = 0.4
 """Share of the departure that may be wrong: transfer functions have terms beyond f²."""
 
 _FREQUENCIES = np.array([(BANDS_PX[0] / scale_px) ** 2 for scale_px in BANDS_PX])
-_CORNER = (np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0).astype(np.float32)
+CORNER = (np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0).astype(np.float32)
+"""The band next to the sampling limit, which measures white noise: a kernel of unit gain for it."""
+
 _GAINS = np.array([band_gain(scale_px) for scale_px in BANDS_PX])
 _FLOOR = 1e-3
 _SURPRISE = 3.0
@@ -80,7 +82,7 @@ def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
     bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
-    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, _CORNER), dtype=np.float32)[middle]]
+    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)[middle]]
 
 
 @dataclass(frozen=True, slots=True)

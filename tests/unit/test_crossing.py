@@ -67,7 +67,34 @@ def test_the_sharpness_that_events_keep_up_to_date_is_that_of_their_image() -> N
     image = np.zeros((50, 60), np.float32)
     np.add.at(image, (y, x), 2.0 * on - 1.0)
     expected = band_energy(image, BANDS_PX[0], np.ones_like(image), 14)
-    assert energy.measure() == pytest.approx(np.log(expected), abs=1e-4)
+    energy.measure()
+    assert energy.raw == pytest.approx(expected, rel=1e-4)
+    upon = EventEnergy(50, 60, 14, image)
+    assert energy.measure() == pytest.approx(upon.measure(), abs=1e-3)
+
+
+@pytest.mark.parametrize("noise", [0, 1, 4])
+def test_what_noise_adds_to_the_sharpness_is_taken_off(noise: int) -> None:
+    rng = np.random.default_rng(5)
+    side = 240
+    scene = cv2.GaussianBlur(rng.standard_normal((side, side)).astype(np.float32), (0, 0), 1.5)
+    energy = EventEnergy(side, side, 14, 8.0 * scene)
+    quiet = energy.measure()
+    x, y = (rng.integers(0, side, noise * side**2).astype(np.uint16) for _ in range(2))
+    energy.add(x, y, rng.integers(0, 2, x.size).astype(np.uint8))
+    assert energy.measure() == pytest.approx(quiet, abs=0.1)
+    assert (energy.raw > 1.5 * np.exp(quiet)) == (noise > 0)
+
+
+def test_a_sensor_that_sees_nothing_shows_no_rise_and_fall_of_sharpness() -> None:
+    rng = np.random.default_rng(6)
+    side, track = 120, PeakTrack()
+    energy = EventEnergy(side, side, 14)
+    for tick in range(120):
+        x, y = (rng.integers(0, side, 400).astype(np.uint16) for _ in range(2))
+        energy.add(x, y, rng.integers(0, 2, x.size).astype(np.uint8))
+        track.add(tick, float(tick), energy.measure())
+        assert not track.passed
 
 
 def test_a_band_passes_white_noise_as_its_gain_says() -> None:
