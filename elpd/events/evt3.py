@@ -55,6 +55,7 @@ from elpd.events.registers import (
     Integer,
     hold_trigger,
 )
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -160,7 +161,8 @@ def skip_to_time(words: NDArray[np.uint16], position: int, state: NDArray[np.int
 
 @kernel(
     f"UniTuple(int64, 2)({WORDS}, int64, int64[::1], int64, int64, "
-    "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1])"
+    "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1])",
+    serves=Encoding.EVT3.value,
 )
 def decode(  # noqa: C901  (one function: calls cost)
     words: NDArray[np.uint16],

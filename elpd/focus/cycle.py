@@ -269,6 +269,7 @@ class FocusCycle:
             self._settings,
             self._deadline_ns,
             exposed=self.map is not None,
+            shown=self._request.reference is None and self._parts.aperture is None,
             sink=self._sink,
             enter=self._phase,
             observe=self._observe,

@@ -54,7 +54,11 @@ class BytePort(Protocol):
 
 
 class EventCamera(Protocol):
-    """A source of events."""
+    """A source of events.
+
+    Its driver's module may have a function ``encodings(settings) -> frozenset[Encoding]`` that says beforehand how the
+    packets of the camera that these settings open may be encoded. Without it the daemon compiles kernels for all.
+    """
 
     @property
     def geometry(self) -> Geometry:

@@ -25,6 +25,7 @@ from elpd.events.evt3_others import TRIPLE, TRIPLE_KINDS, join_triple
 from elpd.events.jit import kernel
 from elpd.events.lanes import four_words
 from elpd.events.registers import HIGH, LOOP, LOW, MAX_SIDE, ROW, VECTOR_ON, VECTOR_X, Integer
+from elpd.records import Encoding
 from elpd.vision.background import CELL, is_alone
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import (
@@ -51,6 +52,9 @@ CAP_US = 5000
 REFILL_US = CAP_US // CAP_EVENTS
 DEPTH_US = CAP_US - REFILL_US
 
+UNCAPPED = "no rate cap"
+"""Whom the plain builds serve: those who measure. A cycle always caps."""
+
 BLOCK_WORDS = 256
 PENDING = 12 * (BLOCK_WORDS + 4)
 """Room for the events of a block, and of the few words that may be taken along with its last."""
@@ -59,6 +63,11 @@ SIGNATURE = (
     f"int64({WORDS}, int64, int64[::1], int64[:, ::1], "
     "int16[::1], int64[::1], int64[::1], int64[:, ::1], int64, int64[::1], uint32[::1], int64[::1])"
 )
+
+
+def served(encoding: Encoding, *, capped: bool) -> str:
+    """Return whom a build of a fused kernel serves (``kernel``)."""
+    return encoding.value if capped else UNCAPPED
 
 
 @kernel()
@@ -182,7 +191,7 @@ def sum_block(
 
 
 def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: C901, FBT001  (one function: calls cost)
-    @kernel(SIGNATURE)
+    @kernel(SIGNATURE, serves=served(Encoding.EVT3, capped=capped))
     def evt3_to_windows(  # noqa: C901
         words: NDArray[np.uint16],
         position: int,

@@ -111,12 +111,13 @@ class EventMemory:
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
+        self._raw: list[float] = []
         self._forgotten = 0 if start is None else start.events
         self._hot = None if hot is None or not hot.any() else hot
         self.capped = 0
         self.depths: tuple[float, ...] = ()
         """Where planes of the region are in focus, nearest first along the sweep, if ``witnesses`` found several."""
-        self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
+        self._least_energy = LEAST_LEVEL * band_gain(BANDS_PX[0])
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
@@ -233,12 +234,13 @@ class EventMemory:
         self._energy.add(x[part], y[part], on[part])
         self._taken = until
         self.track.add(until_us, position, self._energy.measure())
+        self._raw.append(self._energy.raw)
 
     @property
     def peak_passed(self) -> bool:
         """Whether the image has become as sharp as it gets, and duller again, by enough events to believe it."""
         track = self.track
-        if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
+        if not track.passed or track.rise < MIN_RISE or self._raw[track.peak] < self._least_energy:
             return False
         if not self._shows_a_picture():
             return False
@@ -252,13 +254,13 @@ class EventMemory:
         on both sides of the peak.
         """
         track = self.track
-        energies = np.exp(track.values[: track.peak + 1])
+        energies = self._raw[: track.peak + 1]
         lowest = int(np.argmin(energies))
         begin, end = (int(np.searchsorted(self._t_us, track.times_us[k], side="left")) for k in (lowest, track.peak))
         begin = 0 if lowest == 0 else begin
         height, width = self._shape
         at_random = band_gain(BANDS_PX[0]) * (end - begin) / (height * width)
-        gained = float(energies[-1]) - (0.0 if self._start is None and lowest == 0 else float(energies[lowest]))
+        gained = energies[-1] - (0.0 if self._start is None and lowest == 0 else energies[lowest])
         return gained > LEAST_ORDER * at_random
 
     def ask(
