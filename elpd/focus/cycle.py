@@ -44,7 +44,7 @@ from elpd.vision.reference import reference_from_frame
 from elpd.vision.resting import LISTEN_MS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from elpd.focus.picture import Picture
     from elpd.focus.settings import CycleSettings, FocusRequest
@@ -161,6 +161,11 @@ class FocusCycle:
     def map(self) -> TemporalImage | None:
         """The temporal map, once exposed, for whoever wants to store or show it."""
         return self._scene.map
+
+    @property
+    def delays(self) -> Mapping[str, tuple[float, ...]]:
+        """How old the newest packets were, us, by stage."""
+        return self._stage.delays.by_stage()
 
     # --- the line of phases ---
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import CameraError, LensError
 from elpd.events.edges import EdgeReader
+from elpd.focus.delays import Delays
 from elpd.focus.shake import Shake
 from elpd.ports import Latency, TakesMarks, TriggerInput
 from elpd.timebase import SensorClock
@@ -60,6 +61,8 @@ class Stage:
         self._edges = EdgeReader() if wired else None
         self.marks = 0 if wired else None
         """How many position marks were believed; ``None`` where none are wired."""
+        self.delays = Delays()
+        """How old packets were."""
         self.shake = Shake()
         """What the camera's gyroscope says of the rig, where it has one."""
         self.shedding: Shedding | None = None
@@ -127,6 +130,7 @@ class Stage:
         self.lost_events += packet.lost_events
         if packet.complete_until_us is not None:
             self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
+            self.delays.received(self.sensor_clock.to_host(packet.complete_until_us), packet.received_ns)
         if packet.frames:
             self.frame = packet.frames[-1]
         if packet.imu:

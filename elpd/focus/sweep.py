@@ -104,6 +104,7 @@ class Sweep:
             packet = stage.read(READ_TIMEOUT_S)
             if packet is not None:
                 heard_ns = stage.now_ns()
+                stage.delays.taken(packet.received_ns, heard_ns)
                 samples = watch.feed(packet)
                 if watch.passed:
                     stop = lens.stop(plan.stop_mode)
