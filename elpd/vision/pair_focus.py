@@ -10,7 +10,6 @@ import numpy as np
 
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
 from elpd.vision.pairs import Mode, Pairs, weighted_mode
-from elpd.vision.relief import Parts
 from elpd.vision.turns import Slowness, Turns, blocks_of
 from elpd.vision.witness import stray_share
 
@@ -52,8 +51,8 @@ class Lateness:
     """What it makes of the pixels that turned, on the average."""
     unasked: Lag
     """The same if no pair had been asked."""
-    parts: Parts | None = None
-    """Where the blocks of the region turn."""
+    turns: Turns | None = None
+    """The pairs that were asked."""
 
 
 def pair_mode(
@@ -111,7 +110,7 @@ def pair_mode(
     lag = as_known(lags) if focused else average_lag(lags, fit)
     nothing = lag_of(None, unmeasured_lag / usual[0], calibrated)
     unasked = Lag(usual[0] * nothing.at, usual[0] * nothing.sigma)
-    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked, Parts.of(turns))
+    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked, turns)
 
 
 def as_known(lags: list[Lag]) -> Lag:
