@@ -100,9 +100,9 @@ def halves_apart(turns: Turns) -> float:
     squares = []
     for half in _HALVES:
         inside = half[turns.block]
-        modes = [weighted_mode(turns.middle[one], turns.weights[one], turns.width) for one in (inside, ~inside)]
-        if None not in modes:
-            squares.append((modes[0].at - modes[1].at) ** 2)
+        one, other = (weighted_mode(turns.middle[part], turns.weights[part], turns.width) for part in (inside, ~inside))
+        if one is not None and other is not None:
+            squares.append((one.at - other.at) ** 2)
     return 0.5 * float(np.sqrt(np.mean(squares))) if squares else np.inf
 
 
