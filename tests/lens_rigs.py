@@ -1,8 +1,9 @@
-"""A simulated lens behind each board, opened by its driver: in virtual time, or over a pty in real time."""
+"""A simulated lens behind each board, opened by its driver: in virtual time, in memory or over a pty."""
 
 from __future__ import annotations
 
 import functools
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +14,16 @@ from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.boards.line import MemoryPort, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
+from pty_port import PtyPort
 from virtual import MonotonicClock, TestClock
 
 from elpd.units import HostNs, Steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 KINDS = tuple(CONTROLLERS)
+LINES = {"memory": MemoryPort, "pty": PtyPort}
 UM_PER_STEP = 0.3125
 SPEED_SPS = 12_800.0  # 4 mm/s
 
@@ -181,7 +184,7 @@ class Rig:
     clock: TestClock
     motor: SimulatedLens
     board: Any
-    port: MemoryPort
+    port: MemoryPort | PtyPort
     lens: Any = None
     reports: list[Any] = field(default_factory=list)
 
@@ -201,7 +204,7 @@ class Rig:
     def plug_in(self) -> None:
         """Connect the board, which had power all the time, by another cable."""
         self.clock.actors.remove(self.port)
-        self.port = MemoryPort(self.board, self.clock)
+        self.port = type(self.port)(self.board, self.clock)
         self.clock.actors.append(self.port)
 
     def live_until(self, condition: Callable[[], bool], limit_ms: float = 3000.0) -> None:
@@ -236,6 +239,19 @@ def _skip_what_cannot_be_built(kind: str) -> None:
         pytest.skip(hindrance)
 
 
+_line: list[type[MemoryPort | PtyPort]] = [MemoryPort]
+
+
+@contextmanager
+def rigs_over(line: str) -> Iterator[None]:
+    """Let the rigs that are made meanwhile have that kind of line."""
+    _line.append(LINES[line])
+    try:
+        yield
+    finally:
+        _line.pop()
+
+
 def rig(
     kind: str,
     *,
@@ -251,7 +267,7 @@ def rig(
     motor = SimulatedLens(LensMechanics(um_per_step=um_per_step), start_um=start_um)
     kinds = CONTROLLERS[kind].board
     board = kinds.make(motor, kinds.config(referenced=referenced, **config), seed=seed, begin_ns=clock.now_ns())
-    port = MemoryPort(board, clock)
+    port = _line[-1](board, clock)
     clock.actors.append(port)
     return Rig(kind, clock, motor, board, port)
 

@@ -1,6 +1,6 @@
 """What motion alone costs: a simulated lens on every board is swept, stopped and brought back, without a camera.
 
-    python tools/motion_error.py --seeds 20 [--board tic] [--calibrated] [--json]
+    python tools/motion_error.py --seeds 20 [--board tic] [--calibrated] [--adapters] [--json]
 
 Each seed draws where focus is, from which side and from where the sweep comes, and how late it is seen. The sweep, the
 stop and the way back are the ones of a focus cycle; that focus was passed is told, at an instant, and where that was
@@ -9,6 +9,9 @@ the position's model, rounding, backlash (4 um), and whatever the final approach
 the strategy; that error's median, 95th percentile and largest; how near the rotor came to a limit; and of the position
 model, asked at random instants of the motion at once and after it, how often 1.96 of its standard deviations cover the
 truth, its median standard deviation in motion and at rest, and the error's own. A run that ends in a fault is named.
+
+The boards are wired straight to the host. With ``--adapters`` each seed has another USB adapter between, as slow as
+drivers suppose of those that they open by name: how slow this one is, they are not told.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from elpd_drivers.lenses.avr_wire import FASTEST_SPS
+from elpd_drivers.lenses.axis import ADAPTER_LATENCY_SIGMA_US, ADAPTER_LATENCY_US
 from elpd_drivers.sim.boards import avr as avr_board
 from elpd_drivers.sim.controllers import CONTROLLERS, Wanted, controller, fitted
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
@@ -48,6 +52,8 @@ if TYPE_CHECKING:
 UM_PER_STEP, TRAVEL_UM, BACKLASH_UM = 0.3125, 2500.0, 4.0
 SPEED_UM_S, ACCELERATION_UM_S2 = 4000.0, 400_000.0
 DEPTH_OF_FOCUS_UM = 6.0
+BOARDS_OWN_US = 200.0
+"""What boards here take over a command by themselves, about."""
 SEEN_MS = (3.0, 12.0)
 """How late it is noticed that focus was passed."""
 
@@ -106,6 +112,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--board", choices=sorted(CONTROLLERS), action="append")
     parser.add_argument("--calibrated", action="store_true", help="Calibrate the lens's stops first, and use them.")
+    parser.add_argument("--adapters", action="store_true", help="A USB adapter between, each seed another.")
     parser.add_argument("--json", action="store_true", dest="as_json")
     chosen = parser.parse_args()
     rows = []
@@ -121,7 +128,7 @@ def main() -> int:
         runs, faults = [], []
         for seed in range(chosen.first, chosen.first + chosen.seeds):
             try:
-                runs.append(one_run(board, seed, measured))
+                runs.append(one_run(board, seed, measured, adapters=chosen.adapters))
             except LensError as error:
                 faults.append(f"seed {seed}: {error}")
         rows.append({**summary(board, runs), "faults": faults})
@@ -132,14 +139,20 @@ def main() -> int:
     return 0
 
 
-def made(board: str, seed: int, start_um: float) -> tuple[World, SimulatedLens, Lens]:
-    """Make a lens with backlash on a board, homed and open."""
+def made(board: str, seed: int, start_um: float, *, adapters: bool = False) -> tuple[World, SimulatedLens, Lens]:
+    """Make a lens with backlash on a board, homed and open; what adapters add, a board's own latency is part of."""
     world = World()
     fastest_um_s = 3 * SPEED_UM_S if board != "avr" else min(3 * SPEED_UM_S, FASTEST_SPS * UM_PER_STEP)
     mechanics = LensMechanics(um_per_step=UM_PER_STEP, travel_um=TRAVEL_UM, backlash_um=BACKLASH_UM)
     mechanism = SimulatedLens(mechanics, start_um=start_um, history_s=100.0)
     wanted = Wanted(UM_PER_STEP, TRAVEL_UM, fastest_um_s, ACCELERATION_UM_S2)
-    port, table = fitted(board, mechanism, wanted, world, seed=seed)
+    adapter_us = 0.0
+    if adapters:
+        usual_us, sigma_us = ADAPTER_LATENCY_US - BOARDS_OWN_US, ADAPTER_LATENCY_SIGMA_US
+        adapter_us = max(0.0, float(random_stream(seed, "adapter").normal(usual_us, sigma_us)))
+    port, table = fitted(board, mechanism, wanted, world, seed=seed, adapter_ns=round(adapter_us * 1000))
+    if adapters:
+        table = {**table, "latency_us": ADAPTER_LATENCY_US, "latency_sigma_us": ADAPTER_LATENCY_SIGMA_US}
     world.add(port)
     return world, mechanism, controller(board).open_lens(table, world, port)
 
@@ -151,14 +164,14 @@ def calibrated(board: str) -> Mapping[StopMode, StopTiming]:
     return measure_lens(bench.measure(homing=False)).timings()
 
 
-def one_run(board: str, seed: int, measured: Mapping[StopMode, StopTiming]) -> Run:
+def one_run(board: str, seed: int, measured: Mapping[StopMode, StopTiming], *, adapters: bool = False) -> Run:
     """Sweep past focus, stop, go back, rest."""
     chance = random_stream(seed, "motion error")
     sign = int(chance.choice([-1, 1]))
     focus_um = float(chance.uniform(60.0, TRAVEL_UM - 60.0))
     room_um = focus_um if sign > 0 else TRAVEL_UM - focus_um
     start_um = focus_um - sign * float(chance.uniform(30.0, min(400.0, room_um)))
-    world, mechanism, lens = made(board, seed, round(start_um / UM_PER_STEP) * UM_PER_STEP)
+    world, mechanism, lens = made(board, seed, round(start_um / UM_PER_STEP) * UM_PER_STEP, adapters=adapters)
     if measured and isinstance(lens, LearnsStops):
         lens.learn_stops(measured)
     parts = RigParts(world, BlindCamera(world), lens, None, LensScale(UM_PER_STEP))

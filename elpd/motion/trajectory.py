@@ -27,6 +27,7 @@ from elpd.errors import LensError
 from elpd.motion.commanded import REST, Motion
 from elpd.motion.epoch import FURTHER_STEPS, Epoch
 from elpd.motion.kinematics import Knot, lay_out, state_at
+from elpd.motion.reply_time import ReplyTime
 from elpd.records import LensFlag, LensReport, PositionEstimate
 from elpd.units import NS_PER_S, HostNs
 
@@ -39,8 +40,8 @@ class Timing:
     """How well a controller's times are known, all one standard deviation.
 
     ``reply_ns`` is the usual time from the earliest possible instant of sampling to the actual one, and
-    ``reply_sigma_ns`` its scatter from one reply to the next. ``common_sigma_ns`` is what all commands and reports
-    share (an adapter's latency): reports cannot average it away. ``quantum_steps`` is the resolution of a report in
+    ``reply_sigma_ns`` how well that is known for one reply; which part of it all commands and reports share, so that
+    they cannot average it away, is learnt (``reply_time``). ``quantum_steps`` is the resolution of a report in
     motion, ``rest_quantum_steps`` at rest (0 for a controller that counts whole steps and rests on one).
     ``ramp_steps`` is how far firmware's ramps stray from the model's while the speed changes. A reply that took longer
     than ``prompt_ns`` was held up, nobody knows on which side of its sampling.
@@ -49,7 +50,6 @@ class Timing:
 
     reply_ns: int
     reply_sigma_ns: int
-    common_sigma_ns: int
     quantum_steps: float
     rest_quantum_steps: float = 0.0
     ramp_steps: float = 0.0
@@ -62,6 +62,12 @@ _RELAY_S = 2e-4
 _RELAYS = 4
 MARK_NS = 2_000
 """A mark's edge leaves with the step, and a camera stamps it to the microsecond."""
+PLACES = 64
+"""Of so many of a motion's newest reports it is seen whether they were rounded alike."""
+SCATTER_FROM = 3
+"""After so many reports of a motion the next one's surprise tells of its time."""
+_CLEARLY = 2.0
+"""By so many standard deviations one motion must explain a report better than another to be taken for it."""
 _UNLIKELY = 3.0
 """Standard deviations beyond which a report at rest shows that the model's own are too small."""
 HELD_UP_NS = 100_000_000
@@ -100,6 +106,7 @@ class Trajectory:
         self._history_ns = round(history_s * NS_PER_S)
         self._epochs: list[Epoch] = []
         self._commands = 0
+        self._reply = ReplyTime(timing.reply_ns, timing.reply_sigma_ns)
         self.held_ns = 0
         """How long the line is known to keep replies back, after they were sampled as promptly as ever."""
 
@@ -160,12 +167,18 @@ class Trajectory:
         if not self._epochs:
             self.begin(report)
             return
+        width_ns = report.latest_ns - report.earliest_ns
+        if width_ns > 2 * MARK_NS and self._reply.took(width_ns):
+            self._follow_from(1)
         when, _ = self._sampled(report)
         index = self._index(when)
+        if self._not_begun(index, report):
+            self._postpone(index, when)
+            index -= 1
         epoch = self._epochs[index]
         if epoch.hears_nothing_new(report, when):
             return
-        if epoch.marked and report.moving and report.latest_ns - report.earliest_ns > 2 * MARK_NS:
+        if epoch.marked and report.moving and width_ns > 2 * MARK_NS:
             return  # its latency, which all reports share, would outvote the marks
         if not report.moving and self._rests_elsewhere(epoch, report, when):
             self._epochs.insert(index + 1, Epoch(when, when, REST, 0.0, epoch.number, (report.steps, 0.0)))
@@ -174,7 +187,12 @@ class Trajectory:
         if len(epoch.reports) == _MAX_REPORTS:
             del epoch.reports[: _MAX_REPORTS // 2]
         epoch.reports.append(report)
+        self._learn_scatter(index, report)
         self._correct(index, report)
+        if report.moving and self._timing.quantum_steps and not epoch.marked:
+            times_ns = [self._sampled(one)[0] for one in epoch.reports[-PLACES:]]
+            even = [at for at in times_ns if not epoch.motion.changing_speed(state_at(epoch.path, at)[1])]
+            epoch.note_places(even, self._timing.quantum_steps)
         if self._relay(index):
             self._follow_from(index)
         elif index + 1 < len(self._epochs):
@@ -238,6 +256,30 @@ class Trajectory:
 
     # --- below: how it is done -----------------------------------------------------------------------------------
 
+    def _not_begun(self, index: int, report: LensReport) -> bool:
+        """Say whether *report* still tells of the motion before epoch *index*, which should be over by now.
+
+        It says no more than that: when the command will take effect remains as unknown as it was, but for the past.
+        """
+        epoch, before = self._epochs[index], self._epochs[index - 1]
+        if index == 0 or epoch.reports or epoch.anchor is not None or not epoch.delay_sigma_s or self._held_up(report):
+            return False
+        when, sigma_s = self._sampled(report)
+        if when - epoch.nominal_ns > _UNLIKELY * epoch.delay_sigma_s * NS_PER_S:
+            return False
+        steps, velocity, h = before.depends(when)
+        variance = self._variance(before, velocity, h) + self._reading_variance(velocity, sigma_s)
+        off, off_if_begun = report.steps - steps, report.steps - epoch.depends(when)[0]
+        return off * off < _UNLIKELY**2 * variance and off_if_begun**2 - off * off > _CLEARLY**2 * variance
+
+    def _postpone(self, index: int, when: int) -> None:
+        """Let epoch *index* begin after *when*."""
+        epoch = self._epochs[index]
+        epoch.not_before_ns = when
+        later_s, _ = epoch.begins()
+        self._start_at(index, max(when, epoch.nominal_ns + round(later_s * NS_PER_S)))
+        self._follow_from(index)
+
     def _rests_elsewhere(self, epoch: Epoch, report: LensReport, when: int) -> bool:
         """Say whether a motor at rest, by itself and by the model, is not where a model too sure of itself has it.
 
@@ -268,17 +310,21 @@ class Trajectory:
                 return index
         return 0
 
+    def _held_up(self, report: LensReport) -> bool:
+        """Say whether nobody knows on which side of its sampling a reply was held up."""
+        return report.latest_ns - report.earliest_ns > self._timing.prompt_ns + self.held_ns
+
     def _sampled(self, report: LensReport) -> tuple[int, float]:
         """Return when the report was most likely sampled, and the standard deviation of that in seconds."""
         width = max(0, report.latest_ns - report.earliest_ns)
-        if width > self._timing.prompt_ns + self.held_ns:
+        if self._held_up(report):
             return report.earliest_ns + width // 2, width / math.sqrt(12) / NS_PER_S
-        late = min(self._timing.reply_ns, width // 2)
-        return report.earliest_ns + late, min(self._timing.reply_sigma_ns, width / math.sqrt(12)) / NS_PER_S
+        late = min(self._reply.usual_ns, width // 2)
+        return report.earliest_ns + late, min(self._reply.chance_s, width / math.sqrt(12) / NS_PER_S)
 
     def _fastest(self, report: LensReport, velocity: float) -> float:
         """Return the velocity that a reply's time is uncertain at: a stop may lie inside a wide interval."""
-        if report.latest_ns - report.earliest_ns <= self._timing.prompt_ns + self.held_ns:
+        if not self._held_up(report):
             return velocity
         ends = (report.earliest_ns, report.latest_ns)
         return max(velocity, *(state_at(self._epochs[self._index(end)].path, end)[1] for end in ends), key=abs)
@@ -301,7 +347,7 @@ class Trajectory:
             steps, velocity = epoch.anchor
             epoch.steps, epoch.variance = (
                 steps,
-                self._reading_variance(velocity, self._timing.reply_sigma_ns / NS_PER_S),
+                self._reading_variance(velocity, self._reply.chance_s),
             )
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
         further = steps + FURTHER_STEPS
@@ -349,8 +395,24 @@ class Trajectory:
         noise = reading + self._model_variance(epoch, velocity) + self._early_variance(index, when, velocity)
         epoch.lessons.correct(report.steps - steps, h, noise)
 
+    def _learn_scatter(self, index: int, report: LensReport) -> None:
+        """Learn how replies scatter in time, where a motion's other numbers have been learnt."""
+        epoch = self._epochs[index]
+        when, _ = self._sampled(report)
+        steps, velocity, h = epoch.depends(when)
+        if (
+            self._held_up(report)
+            or epoch.marked
+            or len(epoch.reports) <= SCATTER_FROM
+            or epoch.motion.changing_speed(velocity)
+        ):
+            return
+        others = epoch.lessons.variance(h) + self._model_variance(epoch, velocity)
+        others += self._reading_variance(velocity, 0.0) + self._early_variance(index, when, velocity)
+        self._reply.scattered(report.steps - steps, velocity, others)
+
     def _variance(self, epoch: Epoch, velocity: float, h: Sensitivity) -> float:
-        common = 0.0 if epoch.marked else velocity * self._timing.common_sigma_ns / NS_PER_S
+        common = 0.0 if epoch.marked else velocity * self._reply.common_s
         learnt = max(epoch.lessons.variance(h), self._rounding_variance(epoch, velocity))
         return learnt + common * common + self._model_variance(epoch, velocity)
 
@@ -361,7 +423,7 @@ class Trajectory:
         was stopped on its way, with the last one for ever. Marks are not rounded, and targets are known.
         """
         if velocity:
-            return 0.0 if epoch.marked else self._timing.quantum_steps**2 / 12
+            return 0.0 if epoch.marked else self._timing.quantum_steps**2 / 12 * epoch.alike
         stopped = epoch.motion.target_steps is None and epoch.number
         return self._timing.rest_quantum_steps**2 / 12 if stopped else 0.0
 

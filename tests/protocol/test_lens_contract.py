@@ -1,18 +1,31 @@
-"""What every lens driver promises, told as stories in virtual time: simulated lens, simulated board, real bytes."""
+"""What every lens driver promises, told as stories in virtual time: simulated lens, simulated board, real bytes.
+
+In memory, and through a real serial port's driver and the kernel's terminal, which time waits for.
+"""
 
 from __future__ import annotations
 
 import threading
+from typing import TYPE_CHECKING
 
 import pytest
 from elpd_drivers.sim.controllers import CONTROLLERS
-from lens_rigs import KINDS, SPEED_SPS, needs, open_rig, rig
+from lens_rigs import KINDS, LINES, SPEED_SPS, needs, open_rig, rig, rigs_over
 
 from elpd.errors import ConfigError, LensError, UsageError
 from elpd.records import LensFlag, StopMode
 from elpd.units import Steps
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 pytestmark = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture(params=LINES, scope="module", autouse=True)
+def _line(request: pytest.FixtureRequest) -> Iterator[None]:
+    with rigs_over(request.param):
+        yield
 
 
 def test_it_identifies_itself_and_knows_where_it_is(kind: str) -> None:

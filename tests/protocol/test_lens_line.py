@@ -1,24 +1,44 @@
-"""What the line between a driver and its controller may do to it, for every driver, in virtual time."""
+"""What the line between a driver and its controller may do to it, for every driver, in virtual time.
+
+In memory, and through a real serial port's driver and the kernel's terminal, which time waits for.
+"""
 
 from __future__ import annotations
 
 from random import Random
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lens_rigs import DIALECTS, KINDS, SPEED_SPS, Rig, needs, open_rig, rig
+from lens_rigs import DIALECTS, KINDS, LINES, SPEED_SPS, Rig, needs, open_rig, rig, rigs_over
 
 from elpd.errors import LensError
 from elpd.records import LensFlag, StopMode
 from elpd.units import Steps
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 pytestmark = pytest.mark.parametrize("kind", KINDS)
 
 
-def test_replies_that_come_twice_do_no_harm(kind: str) -> None:
+@pytest.fixture(params=LINES, scope="module", autouse=True)
+def _line(request: pytest.FixtureRequest) -> Iterator[None]:
+    with rigs_over(request.param):
+        yield
+
+
+def running(kind: str, speed_sps: float, for_ms: float = 40) -> Rig:
+    """Return a rig whose lens has been running up at that speed for so long."""
     made = open_rig(kind)
-    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    made.lens.run(speed_sps, made.soon(3000))
+    made.live(for_ms)
+    return made
+
+
+def test_replies_that_come_twice_do_no_harm(kind: str) -> None:
+    made = running(kind, SPEED_SPS / 4, 0)
     twice = iter([True] * 4)
     made.port.faults.garble = lambda data: data * 2 if next(twice, False) else data
     made.live(300)
@@ -27,9 +47,7 @@ def test_replies_that_come_twice_do_no_harm(kind: str) -> None:
 
 def test_replies_that_come_late_and_out_of_order_do_no_harm(kind: str) -> None:
     for turn in range(6):
-        made = open_rig(kind)
-        made.lens.run(SPEED_SPS / 4, made.soon(3000))
-        made.live(20 + 1.7 * turn)
+        made = running(kind, SPEED_SPS / 4, 20 + 1.7 * turn)
         seen: list[bytes] = []
 
         def late(data: bytes, seen: list[bytes] = seen) -> bytes:
@@ -46,9 +64,7 @@ def test_replies_that_come_late_and_out_of_order_do_no_harm(kind: str) -> None:
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS, made.soon(3000))
-    made.live(40)
+    made = running(kind, SPEED_SPS)
     made.port.faults.drop_to_host = True
     begun = made.clock.now_ns()
     with pytest.raises(LensError, match="limit"):
@@ -62,9 +78,7 @@ def test_silence_stops_the_motor_and_is_latched(kind: str) -> None:
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_a_line_that_is_dead_outwards_ends_the_motion_inside_the_limits(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS, made.soon(3000))
-    made.live(40)
+    made = running(kind, SPEED_SPS)
     made.port.faults.drop_to_board = True
     with pytest.raises(LensError):
         made.live(200)
@@ -74,9 +88,7 @@ def test_a_line_that_is_dead_outwards_ends_the_motion_inside_the_limits(kind: st
 
 
 def test_an_unplugged_port_is_noticed_at_once_and_the_position_is_unknown(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS, made.soon(3000))
-    made.live(40)
+    made = running(kind, SPEED_SPS)
     made.port.faults.disconnect_at_ns = made.clock.now_ns()
     with pytest.raises(LensError, match="gone"):
         made.live(5)
@@ -87,9 +99,7 @@ def test_an_unplugged_port_is_noticed_at_once_and_the_position_is_unknown(kind: 
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_what_was_unplugged_and_plugged_in_again_can_be_opened_and_used(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS, made.soon(3000))
-    made.live(40)
+    made = running(kind, SPEED_SPS)
     made.port.faults.disconnect_at_ns = made.clock.now_ns()
     with pytest.raises(LensError, match="gone"):
         made.live(5)
@@ -197,8 +207,7 @@ def test_wrong_checksums_are_never_believed(kind: str) -> None:
 
 
 def test_a_few_damaged_replies_do_no_harm(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS / 4, made.soon(3000))
+    made = running(kind, SPEED_SPS / 4, 0)
     damaged = iter([True, True])
     made.port.faults.garble = lambda data: bytes(255 - b for b in data) if next(damaged, False) else data
     made.live(300)
@@ -207,9 +216,7 @@ def test_a_few_damaged_replies_do_no_harm(kind: str) -> None:
 
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_nothing_but_garbage_stops_the_motor(kind: str) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS, made.soon(3000))
-    made.live(40)
+    made = running(kind, SPEED_SPS)
     made.port.faults.garble = lambda data: b"\xa5" * (len(data) + 1)
     with pytest.raises(LensError):
         made.live(300)
@@ -230,9 +237,7 @@ def test_what_an_earlier_session_had_asked_for_does_not_confuse_the_next(kind: s
 @given(data=st.binary(max_size=60))
 @needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
 def test_any_bytes_from_the_line_end_in_a_lens_error_or_nothing(kind: str, data: bytes) -> None:
-    made: Rig = open_rig(kind)
-    made.lens.run(SPEED_SPS / 8, made.soon(3000))
-    made.live(20)
+    made = running(kind, SPEED_SPS / 8, 20)
     first = iter([True])
     made.port.faults.garble = lambda d: data + d if next(first, False) else d
     try:
@@ -245,9 +250,7 @@ def test_any_bytes_from_the_line_end_in_a_lens_error_or_nothing(kind: str, data:
 @needs("remembers", "the controller reports no positions")
 @pytest.mark.parametrize("late_ms", [3, 11, 14, 18, 22, 28])
 def test_an_answer_that_comes_after_the_question_was_asked_again_is_as_old_as_it_is(kind: str, late_ms: int) -> None:
-    made = open_rig(kind)
-    made.lens.run(SPEED_SPS / 4, made.soon(3000))
-    made.live(100)
+    made = running(kind, SPEED_SPS / 4, 100)
     made.reports.clear()
     says, late = made.board.take_output, [late_ms * 1_000_000]
 

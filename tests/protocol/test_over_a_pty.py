@@ -1,4 +1,8 @@
-"""Drivers, boards and the command line over a real pty, in real time. Nothing here asserts how long anything took."""
+"""Ports by their names: one owner each, gone and back again; and programs of their own on the other side of a pty.
+
+Drivers and boards in one process share a virtual time, which waits for the kernel. What runs in another process lives
+in real time; nothing is asserted about how long it took.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,6 @@ import signal
 import subprocess
 import sys
 import termios
-import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,89 +21,86 @@ import ticlib
 from elpd_drivers.lenses.serial_port import SerialPort
 from elpd_drivers.sim.boards.line import TIOCGEXCL, PtyServer
 from elpd_drivers.sim.controllers import CONTROLLERS
-from lens_rigs import DIALECTS, KINDS, SPEED_SPS, needs, served
+from lens_rigs import KINDS, SPEED_SPS, Rig, rig, rigs_over, served
+from pty_port import PtyPort
 from virtual import MonotonicClock
 
 from elpd.errors import BusyError, ConfigError, LensError
-from elpd.records import LensFlag, StopMode
-from elpd.units import HostNs, Steps, after_ms
+from elpd.records import LensFlag
+from elpd.units import Steps, after_ms
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 CLOCK = MonotonicClock()
-# replies over a pty wait for the scheduler, which is busy when tests run side by side
-PATIENT = {"reply_ms": 2000.0}
-
-
-def open_lens(kind: str, port: str, **settings: Any) -> Any:
-    more = {**DIALECTS[kind].homed, **({"connect_ms": 20_000.0} if kind == "grbl" else {})}
-    return CONTROLLERS[kind].open_lens({"port": port, **PATIENT, **more, **settings}, CLOCK, None)
-
-
-def poll_until(lens: Any, condition: Callable[[Any], bool], limit_s: float = 20.0) -> Any:
-    end = after_ms(CLOCK.now_ns(), limit_s * 1000)
-    while CLOCK.now_ns() < end:
-        report = lens.poll()
-        if report is not None and condition(report):
-            return report
-        CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 1))
-    raise AssertionError(f"not within {limit_s} s")
 
 
 @pytest.fixture(params=KINDS)
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+def on_a_pty(request: pytest.FixtureRequest) -> Rig:
+    """Put a board on a pty, in virtual time, that nobody has opened yet."""
+    with rigs_over("pty"):
+        made = rig(str(request.param))
+    made.port.close()
+    return made
+
+
+def opened(made: Rig) -> Any:
+    assert isinstance(made.port, PtyPort)
+    table = {"port": made.port.path, **made.dialect.homed}
+    made.lens = CONTROLLERS[made.kind].open_lens(table, made.clock, None)
+    made.reports.clear()
+    return made.lens
+
+
+def test_a_lens_that_is_opened_by_its_ports_name_homes_and_moves(on_a_pty: Rig) -> None:
+    lens = opened(on_a_pty)
+    assert LensFlag.REFERENCED in lens.home(on_a_pty.soon(30_000)).flags
+    lens.move_to(Steps(3400), SPEED_SPS)
+    on_a_pty.live(600)
+    assert on_a_pty.rotor == pytest.approx(3400, abs=2.1)
+    assert not on_a_pty.reports[-1].moving
+    lens.close()
+
+
+def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(on_a_pty: Rig) -> None:
+    first = opened(on_a_pty)
+    with pytest.raises(BusyError, match="in use by another program"):
+        opened(on_a_pty)
+    assert on_a_pty.rotor == 3200.0
+    first.close()
+    opened(on_a_pty).close()
+
+
+def test_what_comes_back_on_another_pty_can_be_opened_and_is_where_it_was(on_a_pty: Rig) -> None:
+    made = on_a_pty
+    if not made.dialect.remembers:
+        pytest.skip("the controller does not remember where it is")
+    opened(made).move_to(Steps(3300), SPEED_SPS)
+    made.live(300)
+    made.port.faults.disconnect_at_ns = made.clock.now_ns()
+    with pytest.raises(LensError, match="gone"):
+        made.live(5)
+    made.lens.close()
+    with rigs_over("pty"):
+        made.plug_in()
+    made.port.close()
+    opened(made)
+    made.live(20)
+    assert made.rotor == pytest.approx(3300)
+    assert made.reports[-1].steps == pytest.approx(3300, abs=2)
+    made.lens.close()
 
 
 @pytest.fixture
-def board(kind: str) -> Iterator[Any]:
-    server, motor = served(kind, CLOCK)
+def tic_board() -> Iterator[tuple[PtyServer, Any]]:
+    server, motor = served("tic", CLOCK)
     yield server, motor
     server.close()
 
 
-@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
-def test_a_lens_over_a_pty_moves_and_stops_from_another_thread(kind: str, board: Any) -> None:
-    server, motor = board
-    lens = open_lens(kind, server.port)
-    lens.move_to(Steps(3400), SPEED_SPS)
-    poll_until(lens, lambda report: not report.moving and abs(report.steps - 3400) < 2)
-    lens.run(-SPEED_SPS / 4, HostNs(CLOCK.now_ns() + 10_000_000_000))
-    poll_until(lens, lambda report: report.moving)
-    stops: list[Any] = []
-    stopper = threading.Thread(target=lambda: stops.append(lens.stop(StopMode.RAMPED)))
-    stopper.start()
-    report = poll_until(lens, lambda report: not report.moving)
-    stopper.join()
-    assert stops[0].begun_ns <= stops[0].done_ns
-    assert 0 < report.steps < 3400
-    assert motor.velocity_at(CLOCK.now_ns()) == 0.0
-    lens.close()
-
-
-def test_a_lens_over_a_pty_homes(kind: str, board: Any) -> None:
-    server, _ = board
-    lens = open_lens(kind, server.port)
-    report = lens.home(after_ms(CLOCK.now_ns(), 30_000))
-    assert LensFlag.REFERENCED in report.flags
-    lens.close()
-
-
-def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(kind: str, board: Any) -> None:
-    server, motor = board
-    lens = open_lens(kind, server.port)
-    with pytest.raises(BusyError, match="in use by another program"):
-        open_lens(kind, server.port)
-    assert motor.rotor_at(CLOCK.now_ns()) == 3200.0
-    lens.close()
-    open_lens(kind, server.port).close()
-
-
-@pytest.mark.parametrize("kind", ["tic"])
-def test_a_program_that_was_killed_keeps_nobody_from_the_port(board: Any) -> None:
-    server, _ = board
+def test_a_program_that_was_killed_keeps_nobody_from_the_port(tic_board: Any) -> None:
+    server, _ = tic_board
 
     def marked_as_exclusive(descriptor: int) -> bool:
         return fcntl.ioctl(descriptor, TIOCGEXCL, bytes(4)) != bytes(4)
@@ -119,60 +119,6 @@ def test_a_program_that_was_killed_keeps_nobody_from_the_port(board: Any) -> Non
         assert not marked_as_exclusive(watching)
     finally:
         os.close(watching)
-
-
-def test_unplugging_is_an_error_that_says_so(kind: str, board: Any) -> None:
-    server, _ = board
-    lens = open_lens(kind, server.port)
-    server.close()
-    with pytest.raises(LensError, match="gone"):
-        poll_until(lens, lambda _: False)
-    with pytest.raises(LensError, match="gone"):
-        lens.poll()
-    lens.close()
-
-
-@needs("stops", "the controller cannot be stopped, nor told anything else, while it moves")
-def test_a_run_over_a_pty_reverses_and_ends_by_itself(kind: str, board: Any) -> None:
-    if kind == "avr":
-        pytest.skip("the firmware under simavr falls behind the wall clock where the machine is busy")
-    server, _ = board
-    lens = open_lens(kind, server.port)
-    lens.run(SPEED_SPS / 8, after_ms(CLOCK.now_ns(), 60_000))
-    going_up = poll_until(lens, lambda report: report.moving and report.steps > 3210)
-    lens.run(-SPEED_SPS / 2, after_ms(CLOCK.now_ns(), 5000))  # time enough for a busy machine to turn round in
-    turned = poll_until(lens, lambda report: report.steps < going_up.steps - 20)
-    assert turned.steps > 0
-    poll_until(lens, lambda report: not report.moving)
-    lens.close()
-
-
-@needs("remembers", "the controller does not remember where it is")
-def test_what_comes_back_on_another_pty_can_be_opened_and_is_where_it_was(kind: str, board: Any) -> None:
-    server, motor = board
-    lens = open_lens(kind, server.port)
-    lens.move_to(Steps(3300), SPEED_SPS)
-    poll_until(lens, lambda report: not report.moving and abs(report.steps - 3300) < 2)
-    server.close()
-    with pytest.raises(LensError, match="gone"):
-        poll_until(lens, lambda _: False)
-    lens.close()
-    again = PtyServer(server.wire.board)
-    lens = open_lens(kind, again.port)
-    assert motor.rotor_at(CLOCK.now_ns()) == pytest.approx(3300)
-    report = poll_until(lens, lambda report: not report.moving)
-    assert report.steps == pytest.approx(3300, abs=2)
-    lens.close()
-    again.close()
-
-
-def test_nothing_but_garbage_over_a_pty_is_an_error(kind: str, board: Any) -> None:
-    server, _ = board
-    lens = open_lens(kind, server.port, reply_ms=1000.0)
-    server.wire.faults.garble = lambda data: b"\xa5" * len(data)
-    with pytest.raises(LensError, match="limit"):
-        poll_until(lens, lambda _: False)
-    lens.close()
 
 
 def test_a_missing_port_is_named(tmp_path: Path) -> None:

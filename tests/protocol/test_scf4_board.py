@@ -117,6 +117,23 @@ def test_whatever_the_firmware_means_homing_finds_out(relative: str, stops_at_ed
     assert made.lens.position_at(made.clock.now_ns()).steps == pytest.approx(made.rotor, abs=8)
 
 
+def test_a_host_that_looks_seldom_puts_several_moves_together() -> None:
+    made = rig("scf4", referenced=False)
+    look, seldom = made.port.read_available, iter(range(40, 10_000, 7))
+
+    def busy() -> bytes:
+        if abs(made.motor.velocity_at(made.clock.now_ns())) > SPEED_SPS / 4:
+            made.clock.pass_ms(12 + next(seldom) % 23)
+        return look()
+
+    made.port.read_available = busy  # type: ignore[method-assign]
+    made.open(**UNKNOWN)
+    with capture_logs() as logs:
+        made.lens.home(made.soon(60_000))
+    told = next(log for log in logs if "speed_scale" in log)
+    assert told["speed_scale"] == pytest.approx(7_680_000, rel=0.01)
+
+
 def test_what_homing_found_out_is_told_and_lets_the_next_session_do_without() -> None:
     with capture_logs() as told:
         made = homed(speed_scale=5_100_000.0, settings={"max_speed_um_s": 2000.0})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from elpd_drivers.lenses import theia_wire as wire
+from elpd_drivers.sim.aperture import StepperIris
 from hypothesis import given
 from hypothesis import strategies as st
 from lens_rigs import SPEED_SPS, Rig, open_rig, rig, served
@@ -52,6 +53,8 @@ def ready(**config: Any) -> Rig:
         (wire.move(1, 50, 1000), "6601 0032 01 03e8 0d"),
         (wire.move(1, -13, 1200), "6201 000d 01 04b0 0d"),
         (wire.home(1, 0, 1200), "7301 0000 01 04b0 0d"),
+        (wire.set_up(3, wire.Setup(False, False, 75, 10, 200)), "6303000000 004b 000a 00c8 0d"),
+        (wire.move(3, 75, 100), "6603 004b 01 0064 0d"),
     ],
 )
 def test_commands_are_the_vendors(ours: bytes, vendors: str) -> None:
@@ -95,16 +98,16 @@ def test_what_the_board_was_not_told_of_fails(message: bytes) -> None:
 
 
 @pytest.fixture
-def vendor() -> Iterator[tuple[Any, Any]]:
+def vendor() -> Iterator[tuple[Any, Any, Any]]:
     server, motor = served("theia", MonotonicClock())
     control = MCRControl(server.port, logFiles=False)
-    yield control, motor
+    yield control, motor, server.wire.board
     control.close()
     server.close()
 
 
-def test_theia_mcr_homes_it_and_moves_it(vendor: tuple[Any, Any]) -> None:
-    control, motor = vendor
+def test_theia_mcr_homes_it_and_moves_it(vendor: tuple[Any, Any, Any]) -> None:
+    control, motor, _ = vendor
     clock = MonotonicClock()
     assert control.boardInitialized
     assert control.MCRBoard.readFWRevision() == "5.3.1.0.0"
@@ -121,6 +124,20 @@ def test_theia_mcr_homes_it_and_moves_it(vendor: tuple[Any, Any]) -> None:
     assert motor.rotor_at(clock.now_ns()) == pytest.approx(0, abs=1e-3)
     assert control.focus.moveRel(50) == 0
     assert motor.rotor_at(clock.now_ns()) == pytest.approx(50)
+
+
+def test_theia_mcr_turns_its_iris(vendor: tuple[Any, Any, Any]) -> None:
+    control, _, board = vendor
+    iris = StepperIris(75, at_steps=30)
+    board.add_iris(iris)
+    assert control.irisInit(steps=75, move=True)  # closes by all of its way
+    clock = MonotonicClock()
+    assert float(iris.steps_at(clock.now_ns())) == 0.0
+    assert control.iris.setMotorSpeed(200) == 0
+    assert control.iris.moveRel(40, correctForBL=False) == 0
+    assert float(iris.steps_at(clock.now_ns())) == 40.0
+    assert control.iris.moveRel(-15, correctForBL=False) == 0
+    assert float(iris.steps_at(clock.now_ns())) == 25.0
 
 
 # --- our driver --------------------------------------------------------------------------------------------------

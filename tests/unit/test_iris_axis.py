@@ -11,20 +11,23 @@ from lens_rigs import Rig, rig
 
 from elpd.calibrate.aperture import measured_on
 from elpd.config import load
-from elpd.errors import ConfigError, LensError
+from elpd.errors import ConfigError, LensError, UsageError
 from elpd.motion.lens_output import aperture_on_lens
 from elpd.rig import build
 
 STEPS, SPEED_SPS = 4800, 12_800.0
 WAY_MS = 1000 * STEPS / SPEED_SPS
-AXES = {"zaber": 2, "tmcl": 1, "scf4": "C"}
+AXES = {"zaber": 2, "tmcl": 1, "scf4": "C", "theia": 3}
+FEW = {"theia": (75, 200.0)}
+"""Of full steps, as P-irises are driven by boards that do not divide them: as long on its way."""
 everywhere = pytest.mark.parametrize("kind", AXES)
 
 
 def with_iris(kind: str = "zaber", **more: Any) -> tuple[Rig, StepperIris]:
-    made, iris = rig(kind), StepperIris(STEPS, at_steps=STEPS / 2)
+    steps, speed_sps = FEW.get(kind, (STEPS, SPEED_SPS))
+    made, iris = rig(kind), StepperIris(steps, at_steps=steps / 2)
     made.board.add_iris(iris)
-    made.open(**{"iris_axis": AXES[kind], "iris_open": STEPS, "iris_speed_sps": SPEED_SPS, **more})
+    made.open(**{"iris_axis": AXES[kind], "iris_open": steps, "iris_speed_sps": speed_sps, **more})
     return made, iris
 
 
@@ -43,9 +46,9 @@ def test_closing_for_the_first_time_homes_it_and_opening_takes_its_time(kind: st
     assert steps_of(iris, made) == 0.0
     stamp = aperture.open()
     made.live(WAY_MS / 2)
-    assert steps_of(iris, made) == pytest.approx(STEPS / 2, rel=0.02)
+    assert steps_of(iris, made) == pytest.approx(iris.steps / 2, rel=0.02)
     made.live(WAY_MS)
-    assert steps_of(iris, made) == STEPS
+    assert steps_of(iris, made) == iris.steps
     assert stamp.begun_ns < iris.began_ns < stamp.begun_ns + 1e6 * WAY_MS / 10
     assert made.rotor == pytest.approx(3200.0), "the lens stays"
     aperture.close()
@@ -87,11 +90,13 @@ def test_a_fault_of_its_axis_is_named() -> None:
 
 @everywhere
 def test_it_is_driven_no_further_than_its_stop_and_both_ways_from_wherever_it_was(kind: str) -> None:
+    steps, speed_sps = FEW.get(kind, (STEPS, SPEED_SPS))
+    wide = steps - steps // 12
     for begin in (0.0, 1.0):
-        made, iris = rig(kind), StepperIris(STEPS, at_steps=begin * STEPS)
+        made, iris = rig(kind), StepperIris(steps, at_steps=begin * steps)
         made.board.add_iris(iris)
-        made.open(iris_axis=AXES[kind], iris_open=STEPS - 400, iris_speed_sps=SPEED_SPS)
-        for on, place in ((False, 0.0), (True, STEPS - 400), (False, 0.0), (True, STEPS - 400)):
+        made.open(iris_axis=AXES[kind], iris_open=wide, iris_speed_sps=speed_sps)
+        for on, place in ((False, 0.0), (True, wide), (False, 0.0), (True, wide)):
             made.lens.set_output("iris", on=on)
             made.live(600)
             assert steps_of(iris, made) == pytest.approx(place, abs=0.5)
@@ -131,6 +136,35 @@ def test_on_an_scf4_it_turns_at_rest_only_and_a_count_that_is_wrong_is_a_fault()
         made.live(20)
 
 
+def test_on_a_theia_board_lens_and_iris_wait_for_each_other() -> None:
+    made, iris = with_iris("theia", max_speed_um_s=4000.0)
+    made.lens.set_output("iris", on=False)
+    with pytest.raises(UsageError, match="cannot turn the iris now: it moves for another"):
+        made.lens.set_output("iris", on=True)
+    with pytest.raises(UsageError, match="cannot home now"):
+        made.lens.home(made.soon(10_000))
+    made.live(600)
+    assert made.reports, "it is asked again"
+    made.lens.home(made.soon(10_000))
+    made.lens.move_to(4000, SPEED_SPS)
+    with pytest.raises(UsageError, match="cannot turn the iris now"):
+        made.lens.set_output("iris", on=True)
+    made.live(600)
+    assert made.rotor == pytest.approx(4000.0)
+    stands = steps_of(iris, made)
+    made.lens.set_output("iris", on=False)
+    made.live(100)
+    assert steps_of(iris, made) == stands == 0.0, "it is there already"
+
+
+def test_a_turn_that_a_theia_board_refuses_is_a_fault() -> None:
+    made, _ = with_iris("theia")
+    made.board._setups.clear()  # it browned out, and has not been told of its motors since
+    made.lens.set_output("iris", on=False)
+    with pytest.raises(LensError, match="iris's turn failed"):
+        made.live(50)
+
+
 def test_on_an_scf4_nothing_turns_before_homing_has_found_out_how_it_counts() -> None:
     made, iris = with_iris("scf4", trust_position=False, relative="", speed_scale=None)
     with pytest.raises(LensError, match="home it first"):
@@ -151,6 +185,7 @@ def test_on_an_scf4_nothing_turns_before_homing_has_found_out_how_it_counts() ->
         ("scf4", "A", "the lens's own axis"),
         ("scf4", "AB", "it is one of 'B', 'C'"),
         ("scf4", 2, "it is one of 'B', 'C'"),
+        ("theia", 2, "it is one of 3"),
     ],
 )
 def test_axes_that_a_controller_does_not_have_are_refused(kind: str, axis: object, words: str) -> None:
@@ -181,6 +216,18 @@ def test_tables_that_cannot_be_are_refused(table: dict[str, Any], words: str) ->
         with_iris(**table)
 
 
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"iris_speed_sps": 400.0}, "turns its iris at 10 to 200"),
+        ({"iris_open": -75}, "open is above closed on a Theia"),
+    ],
+)
+def test_what_a_theia_board_cannot_do_is_refused(table: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        with_iris("theia", **table)
+
+
 def test_a_device_with_one_axis_says_so() -> None:
     with pytest.raises(LensError, match="BADAXIS"):
         rig("zaber").open(iris_axis=2, iris_open=STEPS, iris_speed_sps=SPEED_SPS)
@@ -200,8 +247,9 @@ def test_what_it_passes_grows_from_dead_band_to_dead_band() -> None:
 
 @everywhere
 def test_the_simulated_rig_has_one_on_its_board(kind: str) -> None:
-    small = ["sim.width=32", "sim.height=32", "state.profiles=false", "sim.iris_steps=4800"]
-    parts = build(load(overrides=[*small, f"sim.board={kind}"]))
+    steps, speed_sps = FEW.get(kind, (STEPS, SPEED_SPS))
+    small = ["sim.width=32", "sim.height=32", "state.profiles=false", f"sim.iris_steps={steps}"]
+    parts = build(load(overrides=[*small, f"sim.iris_speed_sps={speed_sps}", f"sim.board={kind}"]))
     assert parts.aperture is not None
     assert parts.aperture.opening_ms == pytest.approx(520.0)
     assert parts.aperture.close().command == "iris off"

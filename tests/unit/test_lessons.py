@@ -17,7 +17,7 @@ from elpd.motion.trajectory import HELD_UP_NS, Timing, Trajectory
 from elpd.records import LensFlag, LensReport
 from elpd.units import HostNs
 
-TIMING = Timing(reply_ns=200_000, reply_sigma_ns=100_000, common_sigma_ns=50_000, quantum_steps=1.0)
+TIMING = Timing(reply_ns=200_000, reply_sigma_ns=100_000, quantum_steps=1.0)
 SPEED_SPS, ACCELERATION_SPS2 = 4000.0, 640_000.0
 HELD_UP_MS = HELD_UP_NS / 1e6
 small = st.floats(-3.0, 3.0)
@@ -55,7 +55,7 @@ def test_it_is_a_kalman_filter(taught: list[tuple[float, float, float, float, fl
 @pytest.mark.parametrize("share", [-1e-3, 1e-3])
 def test_a_motor_that_keeps_another_pace_is_followed_and_rests_on_its_target(share: float) -> None:
     sure = under_way()
-    paced = under_way(Timing(200_000, 100_000, 50_000, 1.0, pace_sigma=1e-3))
+    paced = under_way(Timing(200_000, 100_000, 1.0, pace_sigma=1e-3))
     begun_ms = 10.0 + SPEED_SPS / ACCELERATION_SPS2 * 500.0
     covered = {id(sure): 0, id(paced): 0}
     for at_ms in range(30, 3000, 6):

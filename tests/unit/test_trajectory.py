@@ -78,7 +78,7 @@ def report(steps: float, at_ms: float, *, moving: bool = False) -> LensReport:
 
 
 def trajectory() -> Trajectory:
-    return Trajectory(Timing(0, 0, 0, quantum_steps=1.0))
+    return Trajectory(Timing(0, 0, quantum_steps=1.0))
 
 
 def test_before_the_first_report_nothing_is_known() -> None:
@@ -87,7 +87,7 @@ def test_before_the_first_report_nothing_is_known() -> None:
 
 
 def test_it_knows_only_as_far_back_as_its_memory() -> None:
-    motor = Trajectory(Timing(0, 0, 0, 1.0), history_s=1.0)
+    motor = Trajectory(Timing(0, 0, 1.0), history_s=1.0)
     motor.observe(report(0, 5000))
     assert motor.position_at(HostNs(4_500_000_000)).steps == 0.0
     with pytest.raises(LensError, match="remembered"):

@@ -43,8 +43,8 @@ SETTLING_SPS = 2000.0
 START_STEPS, TURN_STEPS = 0.5, 4.0
 """How far its ramps stray from the ideal, from rest and through rest, one standard deviation, seen on the firmware."""
 
-SAMPLED_US = 70.0
-"""From a question's last bit to the instant that the answer tells of, in motion: its check, at 16 MHz."""
+SAMPLED_SOONER_US = 45.0
+"""By how much sooner than a command takes effect a question's answer is sampled: it needs its check only."""
 
 STEP_NS = 55_000
 """What a step takes of the processor's time; so much of it everything else has to wait for."""
@@ -93,8 +93,8 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: AvrSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        sampled_ns = round(SAMPLED_US * NS_PER_US)
-        motor = Motor(Timing(sampled_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.5))
+        sampled_ns = max(0, latency.usual_ns - round(SAMPLED_SOONER_US * NS_PER_US))
+        motor = Motor(Timing(sampled_ns, latency.sigma_ns, quantum_steps=0.5, ramp_steps=1.5))
         return DirectLens(
             AvrController(table, clock, line, motor, latency), line, motor, clock, latency, poll_ms=table.query_ms
         )

@@ -330,7 +330,6 @@ class GrblLens:
         timing = Timing(
             reply_ns,
             sigma_ns,
-            sigma_ns // 2,
             quantum,
             rest_quantum_steps=quantum,
             ramp_steps=RAMP_STEPS,

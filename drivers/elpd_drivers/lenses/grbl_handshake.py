@@ -47,7 +47,7 @@ class GrblLensSettings:
     stop_onset_ms: float | None = None
     stop_onset_sigma_ms: float | None = None
     latency_us: float = 225.0
-    latency_sigma_us: float = 110.0
+    latency_sigma_us: float = 101.0
     trust_position: bool = False
 
 

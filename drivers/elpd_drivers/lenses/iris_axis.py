@@ -69,12 +69,32 @@ class IrisAxis(Generic[A]):
         """From where, if it is called that wherever it is, the way to ``closed_steps`` ends at the closed stop."""
         return self.closed_steps + round(INTO_STOP * (self.open_steps - self.closed_steps))
 
-    def unknown(self) -> LensError:
-        """Return what to raise when it is to open and nobody knows where it is."""
-        return LensError(
-            f"lens: axis {self.axis} does not know where the iris is; close it first, that homes it (`elpd expose` "
-            "closes and opens it)"
-        )
+
+class IrisPlace(Generic[A]):
+    """Where an iris is, as far as it was told: nobody knows before its first closing in a session.
+
+    Parameters
+    ----------
+    axis
+        Where it can be sent.
+    """
+
+    def __init__(self, axis: IrisAxis[A]) -> None:
+        self.axis: IrisAxis[A] = axis
+        self.steps: int | None = None
+
+    def way(self, *, opened: bool) -> tuple[int, int]:
+        """Return from where to where it is to go; unknown, it is so far away that the way ends at its closed stop.
+
+        Raises ``LensError`` where it is to open and nobody knows where it is.
+        """
+        if self.steps is None and opened:
+            raise LensError(
+                f"lens: axis {self.axis.axis} does not know where the iris is; close it first, that homes it (`elpd "
+                "expose` closes and opens it)"
+            )
+        here = self.axis.before_stop if self.steps is None else self.steps
+        return here, self.axis.target(opened=opened)
 
 
 def iris_axis(settings: IrisSettings[A], lens_axis: A, axes: Sequence[A]) -> IrisAxis[A] | None:

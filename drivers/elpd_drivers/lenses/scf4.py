@@ -80,7 +80,7 @@ class Scf4Settings:
     query_ms: float = 4.0
     reply_ms: float = 60.0
     latency_us: float = 300.0
-    latency_sigma_us: float = 120.0
+    latency_sigma_us: float = 87.0
     iris_axis: str | None = None
     iris_closed: int = 0
     iris_open: int = 0
@@ -95,7 +95,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: Scf4Settings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        timing = Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns // 2, quantum_steps=2.0, ramp_steps=1.0)
+        timing = Timing(latency.usual_ns, latency.sigma_ns, quantum_steps=2.0, ramp_steps=1.0)
         motor = Motor(timing)
         controller = Scf4Controller(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms / 2)

@@ -216,22 +216,25 @@ class Homing:
     def _timed(self, target: int, code: int) -> Generator[None, Seen, tuple[float, float]]:
         """Go to a count at a code; return speed times code, and its relative standard error.
 
-        A busy machine may have looked away meanwhile: what was seen too seldom or too vaguely is done again.
+        A busy machine may have looked away meanwhile: what was seen too seldom or too vaguely is done again, and all
+        that was seen counts.
         """
         self._say(f"M240 A{code}")
         seen = yield from self._rest()
         begin = seen.count
+        moves: list[list[Seen]] = []
         for tries_left in reversed(range(TIMINGS)):
             readings = yield from self._watched(begin, target)
-            speed, sigma = _speed(readings, code) if len(readings) >= ENOUGH else (0.0, np.inf)
+            moves.append(readings)
+            speed, sigma = _speed(moves, code)
             if sigma <= ALIKE / 4 or (tries_left == 0 and np.isfinite(sigma)):
                 return speed, sigma
             if tries_left:
                 self._say(f"G0 A{begin - target}")
                 yield from self._rest()
         raise Trouble(
-            f"only {len(readings)} positions came during a move of {abs(target - begin)} steps (at least {ENOUGH} are "
-            f"needed to time it), {TIMINGS} times; see lens.query_ms, and that the motor turns"
+            f"only {sum(len(one) for one in moves)} positions came during {TIMINGS} moves of {abs(target - begin)} "
+            f"steps (at least {ENOUGH} are needed to time them); see lens.query_ms, and that the motor turns"
         )
 
     def _watched(self, begin: int, target: int) -> Generator[None, Seen, list[Seen]]:
@@ -253,15 +256,31 @@ class Homing:
             raise Trouble(f"speed times code of M240 is {one:.0f}, and {other:.0f} {what}; {then}")
 
 
-def _speed(readings: list[Seen], code: int) -> tuple[float, float]:
-    """Fit a speed to those readings whose instants are known best; return it times *code*, and its relative error."""
-    usual_ns = median(seen.latest_ns - seen.earliest_ns for seen in readings)
-    good = [seen for seen in readings if seen.latest_ns - seen.earliest_ns <= usual_ns]
-    times = np.array([(seen.earliest_ns + seen.latest_ns) / 2 for seen in good]) / NS_PER_S
-    counts = np.array([seen.count for seen in good], dtype=np.float64)
-    times -= times.mean()
-    spread = float(times @ times)
-    slope = float(times @ counts) / spread
-    residue = counts - counts.mean() - slope * times
-    sigma = float(np.sqrt((residue @ residue) / max(len(good) - 2, 1) / spread))
+def _speed(moves: list[list[Seen]], code: int) -> tuple[float, float]:
+    """Fit one speed to moves that were alike; return it times *code*, and its relative error (infinite: too few).
+
+    Of each move those readings count whose instants are known best. The shortest shows how long the board takes to
+    answer; what took longer was looked at late. When a move set out nobody knows, so that each is compared with its
+    own mean.
+    """
+    widths_ns = [seen.latest_ns - seen.earliest_ns for move in moves for seen in move] or [0]
+    usual_ns, shortest_ns = median(widths_ns), min(widths_ns)
+    times, counts = [np.empty(0)], [np.empty(0)]
+    for move in moves:
+        good = [seen for seen in move if seen.latest_ns - seen.earliest_ns <= usual_ns]
+        if len(good) > 1:
+            at = np.array([seen.earliest_ns + shortest_ns / 2 for seen in good]) / NS_PER_S
+            count = np.array([seen.count for seen in good], dtype=np.float64)
+            times.append(at - at.mean())
+            counts.append(count - count.mean())
+    fitted = len(times)  # one number each, and the speed
+    t, n = np.concatenate(times), np.concatenate(counts)
+    spread = float(t @ t)
+    if sum(len(move) for move in moves) < ENOUGH or len(t) <= fitted or spread == 0.0:
+        return 0.0, np.inf
+    slope = float(t @ n) / spread
+    if slope == 0.0:
+        return 0.0, np.inf
+    residue = n - slope * t
+    sigma = float(np.sqrt((residue @ residue) / (len(t) - fitted) / spread))
     return abs(slope) * code, sigma / abs(slope)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import LensError
 from elpd_drivers.lenses import scf4_wire as wire
+from elpd_drivers.lenses.iris_axis import IrisPlace
 from elpd_drivers.lenses.line import Trouble
 
 if TYPE_CHECKING:
@@ -33,43 +34,39 @@ class Scf4Iris:
     """
 
     def __init__(self, line: Line, axis: IrisAxis[str]) -> None:
-        self._line, self._axis = line, axis
-        self._steps: int | None = None
+        self._line, self._place = line, IrisPlace(axis)
         self._turned_ns = 0
         self._stands = True
 
     def forget(self) -> None:
         """Learn that the board counts anew: nobody knows where it is."""
-        self._steps, self._stands = None, True
+        self._place.steps, self._stands = None, True
 
     def heed(self, line: str, asked_ns: int) -> None:
         """Learn from a status that was asked for at *asked_ns*. Raises ``Trouble`` if it stands elsewhere."""
-        status = wire.parse_status(line, self._axis.axis)
-        if status is None or self._steps is None or asked_ns <= self._turned_ns:
+        motor, steps = self._place.axis.axis, self._place.steps
+        status = wire.parse_status(line, motor)
+        if status is None or steps is None or asked_ns <= self._turned_ns:
             return
         self._stands = not status.moving
-        count = wire.HOMED_COUNT + self._steps
+        count = wire.HOMED_COUNT + steps
         if self._stands and status.count != count:
             raise Trouble(
-                f"the iris's motor {self._axis.axis} stands at {status.count} instead of {count}; see that its way is "
+                f"the iris's motor {motor} stands at {status.count} instead of {count}; see that its way is "
                 "free (lens.iris_open, iris_closed), and switch the board off and on"
             )
 
     def turn(self, code: int, relative: str, *, opened: bool) -> Sent | None:
         """Send it on its way, at *code*; ``None`` if it is there. Raises ``LensError`` if it cannot go now."""
-        motor, target = self._axis.axis, self._axis.target(opened=opened)
         if not self._stands:
             raise LensError("lens: the iris still turns, and an SCF4 is told nothing before it stands; wait for it")
+        motor, (here, target) = self._place.axis.axis, self._place.way(opened=opened)
         orders = [relative, f"M240 {motor}{code}"]
-        here = self._steps
-        if here is None:
-            if opened:
-                raise self._axis.unknown()
-            here = self._axis.before_stop
+        if self._place.steps is None:
             orders.append(f"G92 {motor}{wire.HOMED_COUNT + here}")
         if here == target:
             return None
         orders.append(f"G0 {motor}{target - here}")
         sent = self._line.send(b"".join(wire.order(order) for order in orders))
-        self._steps, self._turned_ns, self._stands = target, sent.off_wire_ns, False
+        self._place.steps, self._turned_ns, self._stands = target, sent.off_wire_ns, False
         return sent

@@ -9,7 +9,8 @@ At the switch the board ends a motion by itself and does not tell; but the answe
 shows here: the position was not what it seemed, and the lens must be homed. A move whose answer was lost is never sent
 again: relative moves done twice go twice as far. With a ``position_file`` the count outlives the session.
 
-Positions count from the switch, upwards with the command 0x66.
+Positions count from the switch, upwards with the command 0x66. The lens's iris, on another motor (``theia_iris``), is
+turned while the lens rests only.
 """
 
 from __future__ import annotations
@@ -21,17 +22,20 @@ from typing import TYPE_CHECKING, Any
 
 import structlog
 
-from elpd.errors import ConfigError, LensError, UsageError
+from elpd.errors import LensError, UsageError
 from elpd.motion.commanded import Motion
 from elpd.motion.trajectory import Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensLimits, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses import theia_wire as wire
 from elpd_drivers.lenses.asking import Asking
-from elpd_drivers.lenses.axis import check_speed, check_target, limits_from, run_target
+from elpd_drivers.lenses.axis import check_output, check_speed, check_target, run_target
+from elpd_drivers.lenses.iris_axis import IRIS
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.motor import Motor
 from elpd_drivers.lenses.remembered import Remembered
+from elpd_drivers.lenses.theia_iris import theia_iris
+from elpd_drivers.lenses.theia_settings import SLOWEST_PPS, TheiaSettings, limits_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -43,10 +47,6 @@ if TYPE_CHECKING:
 _log = structlog.get_logger()
 
 OLDEST_FIRMWARE = 5
-SLOWEST_PPS = 100
-START_S = 1e-4
-"""It starts and ends at full speed, as far as anybody can tell."""
-
 AWAY_STEPS = 200
 """How far to go back into the travel before the switch is looked for again, as the maker's library does."""
 
@@ -58,35 +58,6 @@ PAUSE_NS = 20 * NS_PER_MS
 
 
 REMEDY = "name a file in lens.position_file, where the position is kept from one program to the next"
-
-
-@dataclass(frozen=True, slots=True)
-class TheiaSettings:
-    """The table ``[lens]`` for a Theia MCR board. 0 um is at the switch of the motor.
-
-    ``motor`` is 1 (focus) or 2 (zoom). ``switch`` says at which end of the travel it is: "low" where 0x66 leads away
-    from it. ``connect_ms`` is how long to wait for a board that does not answer because it moves, ``late_ms`` how much
-    longer than it should take a motion may go without an answer. ``position_file`` is where to keep the position from
-    one session to the next; without it each begins with homing. ``latency_us`` is the usual time from a command's
-    last bit to its effect, USB included, and ``latency_sigma_us`` how well that is known; unless given, a real port
-    gets what USB adapters need.
-    """
-
-    port: str = ""
-    baud: int = 115_200
-    motor: int = 1
-    switch: str = "low"
-    um_per_step: float = 0.3125
-    min_um: float = 0.0
-    max_um: float = 2500.0
-    max_speed_um_s: float = 375.0
-    query_ms: float = 20.0
-    reply_ms: float = 100.0
-    connect_ms: float = 5000.0
-    late_ms: float = 500.0
-    position_file: str = ""
-    latency_us: float = 300.0
-    latency_sigma_us: float = 120.0
 
 
 def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None = None) -> TheiaLens:
@@ -102,10 +73,10 @@ class TheiaLens:
 
     def __init__(self, settings: TheiaSettings, clock: Clock, line: Line) -> None:
         self._settings, self._clock, self._line = settings, clock, line
-        self.limits: LensLimits = _limits(settings)
+        self.limits: LensLimits = limits_of(settings)
         self._sigma_ns = round(settings.latency_sigma_us * NS_PER_US)
         self._latency_ns = round(settings.latency_us * NS_PER_US)
-        self._motor = Motor(Timing(self._latency_ns, self._sigma_ns, self._sigma_ns // 2, 2.0, ramp_steps=1.0))
+        self._motor = Motor(Timing(self._latency_ns, self._sigma_ns, 2.0, ramp_steps=1.0))
         self._asking = Asking(settings.query_ms, settings.reply_ms)
         self._replies = wire.ReplyReader()
         self._asked_ns = 0
@@ -114,6 +85,7 @@ class TheiaLens:
         self._remembered = Remembered(settings.position_file, ruler)
         self._steps = 0
         self._at_switch = False
+        self._iris = theia_iris(settings)
 
     # --- what the cycle sees ---------------------------------------------------------------------------------------
 
@@ -139,12 +111,9 @@ class TheiaLens:
         """Identify the board, tell it of its motor; where that is is remembered, or unknown (and called 0)."""
         with self._guarded():
             self._identify()
-            self._line.send(wire.set_up(self._settings.motor, self._setup()))
-            due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
-            while (reply := self._newest(wire.SET_UP)) is None:
-                self._wait(due, "no answer to the motor's set-up (0x63); check the cable")
-            if reply[1] != 0:
-                raise Trouble("the board refuses the motor's set-up (0x63); compare [lens] with its manual")
+            self._set_up(self._settings.motor, self._setup())
+            if self._iris is not None:
+                self._set_up(self._iris.motor, self._iris.setup())
             steps = self._remembered.recall()
             if steps is not None and self.limits.min_steps <= steps <= self.limits.max_steps:
                 self._steps, self._motor.referenced = steps, True
@@ -204,6 +173,24 @@ class TheiaLens:
             report = self._poll()
             return None if report is None else self._flagged(report)
 
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The stepper iris, if there is one."""
+        return () if self._iris is None else (IRIS,)
+
+    def set_output(self, name: str, *, on: bool) -> CommandStamp:
+        """Open or close the iris. The board does nothing else meanwhile: ``UsageError`` while the lens moves."""
+        check_output(name, self.outputs)
+        assert self._iris is not None, "it has that output"
+        with self._guarded():
+            self._refuse_moving(f"turn the {name}")
+            turn = self._iris.turn(opened=on)
+            now = self._clock.now_ns()
+            if turn is None:
+                return CommandStamp(f"{name} {'on' if on else 'off'}", now, now)
+            sent = self._send(turn.message, turn.takes_s, None, lens=False)
+        return CommandStamp(f"{name} {'on' if on else 'off'}", sent.written_from_ns, sent.written_to_ns)
+
     def position_at(self, when: HostNs) -> PositionEstimate:
         """Return where the motor was at *when*, by its commands."""
         return self._motor.position_at(when)
@@ -236,6 +223,14 @@ class TheiaLens:
                     f"lens port {name}: no answer from a Theia MCR board for {self._settings.connect_ms:.0f} ms; check "
                     "its power, and that this is its port; while a motor moves it does not answer either"
                 )
+
+    def _set_up(self, motor: int, setup: wire.Setup) -> None:
+        self._line.send(wire.set_up(motor, setup))
+        due = after_ms(self._clock.now_ns(), self._settings.reply_ms)
+        while (reply := self._newest(wire.SET_UP)) is None:
+            self._wait(due, f"no answer to the set-up of motor {motor} (0x63); check the cable")
+        if reply[1] != 0:
+            raise Trouble(f"the board refuses the set-up of motor {motor} (0x63); compare [lens] with its manual")
 
     def _setup(self) -> wire.Setup:
         low = self._settings.switch == "low"
@@ -283,13 +278,14 @@ class TheiaLens:
             self._motor.command(motion, sent.begun_ns + self._latency_ns, self._sigma_ns)
             return CommandStamp(name, sent.written_from_ns, sent.written_to_ns)
 
-    def _send(self, message: bytes, takes_s: float, target: int | None) -> _Going:
-        self._remembered.forget()
+    def _send(self, message: bytes, takes_s: float, target: int | None, *, lens: bool = True) -> _Going:
+        if lens:
+            self._remembered.forget()
+            self._at_switch = False
         sent = self._line.send(message)
-        self._at_switch = False
         late_ns = round(self._settings.late_ms * NS_PER_MS)
         ends_ns = sent.off_wire_ns + round(takes_s * NS_PER_S)
-        self._going = _Going(sent.begun_ns, sent.done_ns, sent.off_wire_ns, ends_ns, ends_ns + late_ns, target)
+        self._going = _Going(sent.begun_ns, sent.done_ns, sent.off_wire_ns, ends_ns, ends_ns + late_ns, target, lens)
         return self._going
 
     def _refuse_moving(self, what: str) -> None:
@@ -328,6 +324,10 @@ class TheiaLens:
     def _over(self, going: _Going, reply: bytes, earliest_ns: int, latest_ns: int) -> LensReport:
         """Take the end of a motion: at its target, unless the board says no, or it came too early."""
         self._going = None
+        if not going.lens:
+            if reply[1] != 0:
+                raise Trouble("the board says that the iris's turn failed; look at lens.iris_open and iris_speed_sps")
+            return self._report(earliest_ns, latest_ns)
         assert going.target is not None, "homing waits for its own end"
         if reply[1] != 0:
             raise Trouble("the board says that a move failed; where it ended is unknown, home it")
@@ -388,7 +388,7 @@ class TheiaLens:
 
 @dataclass(frozen=True, slots=True)
 class _Going:
-    """A motion that was sent: when, when it should be over, when its answer is overdue, and where it leads."""
+    """A motion of the lens (or the iris): when it was sent, should be over and is overdue, and where it leads."""
 
     written_from_ns: HostNs
     written_to_ns: HostNs
@@ -396,23 +396,4 @@ class _Going:
     ends_ns: int
     late_ns: int
     target: int | None
-
-
-def _limits(settings: TheiaSettings) -> LensLimits:
-    """Read the limits, and refuse what the board's messages cannot carry."""
-    ramp_um_s2 = settings.max_speed_um_s / START_S
-    limits = limits_from(settings.um_per_step, settings.min_um, settings.max_um, settings.max_speed_um_s, ramp_um_s2)
-    if settings.motor not in {1, 2} or settings.switch not in {"low", "high"}:
-        raise ConfigError('lens: motor is 1 (focus) or 2 (zoom), switch is "low" or "high"; correct them')
-    if not limits.min_steps <= 0 <= limits.max_steps or (limits.min_steps < 0) == (settings.switch == "low"):
-        raise ConfigError(
-            f"lens: {settings.min_um:g} to {settings.max_um:g} um must begin (lens.switch low) or end (high) at 0, the "
-            "switch; correct min_um and max_um"
-        )
-    if limits.max_steps - limits.min_steps > wire.LONGEST_MOVE or limits.max_speed_sps > wire.LONGEST_MOVE:
-        raise ConfigError(f"lens: the travel in steps and the speed in steps/s must not exceed {wire.LONGEST_MOVE}")
-    if limits.max_speed_sps < SLOWEST_PPS:
-        raise ConfigError(
-            f"lens: max_speed_um_s is {limits.max_speed_sps:g} steps/s, at least {SLOWEST_PPS} are needed"
-        )
-    return limits
+    lens: bool

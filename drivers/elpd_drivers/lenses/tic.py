@@ -75,7 +75,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: TicSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns, quantum_steps=1.0, ramp_steps=0.3))
+        motor = Motor(Timing(latency.usual_ns, latency.sigma_ns, quantum_steps=1.0, ramp_steps=0.3))
         controller = TicController(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms)
 

@@ -51,7 +51,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
 
     def build(table: TmclSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
-        timing = Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns // 2, quantum_steps=1.0, ramp_steps=0.3)
+        timing = Timing(latency.usual_ns, latency.sigma_ns, quantum_steps=1.0, ramp_steps=0.3)
         motor = Motor(timing)
         controller = TmclController(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms)

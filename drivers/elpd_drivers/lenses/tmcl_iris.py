@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import ConfigError, LensError
 from elpd_drivers.lenses import tmcl_wire as wire
-from elpd_drivers.lenses.iris_axis import iris_axis
+from elpd_drivers.lenses.iris_axis import IrisPlace, iris_axis
 from elpd_drivers.lenses.line import Trouble
 from elpd_drivers.lenses.tmcl_talk import learn_units
 
@@ -36,12 +36,11 @@ class TmclIris:
     """
 
     def __init__(self, talk: Talk, axis: IrisAxis[int]) -> None:
-        self._talk, self._axis = talk, axis
-        self._found = False
+        self._talk, self._place = talk, IrisPlace(axis)
 
     def meet(self) -> None:
         """See that the motor is there, and set its speed. Raises ``LensError`` or ``ConfigError`` if it cannot be."""
-        axis, talk = self._axis, self._talk
+        axis, talk = self._place.axis, self._talk
         reply = talk.attempt(wire.GAP, wire.POSITION, motor=axis.axis)
         if reply.status != wire.OK:
             words = wire.STATUS_WORDS.get(reply.status, "unknown")
@@ -56,22 +55,21 @@ class TmclIris:
                 f"{wire.TMC429_MAX * units.speed_sps:.0f}; change one of them (axis parameter 154)"
             )
         talk.exchange(wire.SAP, wire.MAX_SPEED, units.speed(axis.speed_sps), motor=axis.axis)
-        self._found = False
+        self._place.steps = None
 
     def turn(self, *, opened: bool) -> Sent:
         """Send it on its way. Nothing else may be in flight. Raises ``LensError`` for an opening before any closing."""
-        axis, talk = self._axis, self._talk
+        axis, talk = self._place.axis, self._talk
         flags = talk.exchange(wire.GAP, wire.DRIVER_FLAGS, motor=axis.axis)
         words = ", ".join(word for bit, word in wire.DRIVER_WORDS.items() if flags & bit)
         if words:
             raise Trouble(f"the iris's motor driver stopped: {words} (flags {flags:#04x}); remove the cause")
-        if not self._found:
-            if opened:
-                raise axis.unknown()
+        here, target = self._place.way(opened=opened)
+        if self._place.steps is None:
             talk.exchange(wire.MST, motor=axis.axis)  # a position may be set where none is held
-            talk.exchange(wire.SAP, wire.POSITION, axis.before_stop, motor=axis.axis)
-            self._found = True
-        sent = talk.line.send(talk.frame(wire.MVP, wire.ABSOLUTE, axis.target(opened=opened), motor=axis.axis))
+            talk.exchange(wire.SAP, wire.POSITION, here, motor=axis.axis)
+        sent = talk.line.send(talk.frame(wire.MVP, wire.ABSOLUTE, target, motor=axis.axis))
+        self._place.steps = target
         talk.confirm(wire.MVP)
         return sent
 

@@ -50,7 +50,7 @@ class TmclSettings:
     query_ms: float = 5.0
     reply_ms: float = 100.0
     latency_us: float = 250.0
-    latency_sigma_us: float = 100.0
+    latency_sigma_us: float = 87.0
     iris_axis: int | None = None
     iris_closed: int = 0
     iris_open: int = 0

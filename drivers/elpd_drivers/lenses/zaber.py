@@ -29,13 +29,13 @@ from elpd_drivers.lenses.iris_axis import IRIS, iris_axis
 from elpd_drivers.lenses.line import Trouble, open_on_line
 from elpd_drivers.lenses.lines import LineReader
 from elpd_drivers.lenses.motor import Motor
+from elpd_drivers.lenses.zaber_iris import ZaberIris
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from elpd.ports import BytePort, Clock
     from elpd.records import LensReport
-    from elpd_drivers.lenses.iris_axis import IrisAxis
     from elpd_drivers.lenses.line import Line, Sent
 
 IDENTIFICATIONS = 3
@@ -68,7 +68,7 @@ class ZaberSettings:
     query_ms: float = 6.0
     reply_ms: float = 60.0
     latency_us: float = 300.0
-    latency_sigma_us: float = 120.0
+    latency_sigma_us: float = 87.0
     iris_axis: int | None = None
     iris_closed: int = 0
     iris_open: int = 0
@@ -84,7 +84,7 @@ def open_lens(settings: Mapping[str, Any], clock: Clock, port: BytePort | None =
     def build(table: ZaberSettings, line: Line) -> DirectLens:
         latency = Latency.from_us(table.latency_us, table.latency_sigma_us)
         # whether a count in motion is rounded or the last step is not documented: it may be either
-        timing = Timing(latency.usual_ns, latency.sigma_ns, latency.sigma_ns // 2, quantum_steps=2.0, ramp_steps=0.3)
+        timing = Timing(latency.usual_ns, latency.sigma_ns, quantum_steps=2.0, ramp_steps=0.3)
         motor = Motor(timing)
         controller = ZaberController(table, clock, line, motor, latency)
         return DirectLens(controller, line, motor, clock, latency, poll_ms=table.query_ms)
@@ -115,8 +115,8 @@ class ZaberController:
         self._asked_off_ns = 0
         self._orders: set[int] = set()
         self._busy = self._referenced = False
-        self._iris = iris_axis(settings, settings.axis, range(1, 10))
-        self._iris_referenced = False
+        axis = iris_axis(settings, settings.axis, range(1, 10))
+        self._iris = None if axis is None else ZaberIris(axis, self._exchange, self._order)
 
     @property
     def trouble_bytes(self) -> bytes:
@@ -151,7 +151,7 @@ class ZaberController:
         self._referenced = reply.flag not in wire.NOT_REFERENCED
         self.limits = self._agreed_limits()
         if self._iris is not None:
-            self._meet_iris(self._iris)
+            self._iris.meet()
 
     def referenced(self) -> bool:
         """Whether the device says that its position is referenced."""
@@ -299,44 +299,13 @@ class ZaberController:
     def switch(self, name: str, *, on: bool) -> Sent:
         """Switch a digital output, or send the iris on its way: one command, whose reply ``read`` looks at."""
         if self._iris is not None and name == IRIS:
-            return self._turn_iris(self._iris, opened=on)
+            return self._iris.turn(opened=on)
         return self._order(0, f"io set do {name.removeprefix('do')} {int(on)}")
 
     def _order(self, axis: int, words: str) -> Sent:
         number = self._next_number()
         self._orders.add(number)
         return self._line.send(wire.command(self._settings.device, axis, words, number))
-
-    def _meet_iris(self, iris: IrisAxis[int]) -> None:
-        """See that the iris's axis is there, can reach both places, and whether it knows where it is."""
-        low, high = (self._iris_number(iris, f"limit.{end}") for end in ("min", "max"))
-        for name, steps in (("iris_closed", iris.closed_steps), ("iris_open", iris.open_steps)):
-            if not low <= steps <= high:
-                raise ConfigError(
-                    f"lens.{name} is {steps}, axis {iris.axis} of the device goes from {low:g} to {high:g}; "
-                    "change one of them"
-                )
-        fastest_sps = self._iris_number(iris, "maxspeed") / wire.SPEED_PER_SPS
-        if iris.speed_sps > fastest_sps * (1 + 1e-6):
-            raise ConfigError(
-                f"lens.iris_speed_sps is {iris.speed_sps:g}, axis {iris.axis} of the device makes {fastest_sps:.0f} "
-                "at the most (its maxspeed); change one of them"
-            )
-
-    def _iris_number(self, iris: IrisAxis[int], setting: str) -> float:
-        reply = self._exchange(f"get {setting}", axis=iris.axis)
-        self._iris_referenced = reply.flag not in wire.NOT_REFERENCED
-        return float(reply.data)
-
-    def _turn_iris(self, iris: IrisAxis[int], *, opened: bool) -> Sent:
-        """Open or close it. The first closing since power-up is the homing of its axis, to its closed end."""
-        if not self._iris_referenced:
-            if opened:
-                raise iris.unknown()
-            self._iris_referenced = True
-            return self._order(iris.axis, "home")
-        units = max(1, math.floor(iris.speed_sps * wire.SPEED_PER_SPS + 1e-6))
-        return self._order(iris.axis, f"move abs {iris.target(opened=opened)} {units}")
 
     # --- homing ----------------------------------------------------------------------------------------------------
 

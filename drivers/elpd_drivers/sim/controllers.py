@@ -123,9 +123,14 @@ def controller(name: str) -> Controller:
     return CONTROLLERS[name]
 
 
-def fitted(name: str, lens: SimulatedLens, wanted: Wanted, clock: Clock, *, seed: int) -> tuple[MemoryPort, Table]:
-    """Power the board up in front of *lens*, homed, behind a line in memory; return it and its driver's table."""
+def fitted(
+    name: str, lens: SimulatedLens, wanted: Wanted, clock: Clock, *, seed: int, adapter_ns: int = 0
+) -> tuple[MemoryPort, Table]:
+    """Power the board up in front of *lens*, homed, behind a line in memory; return it and its driver's table.
+
+    An adapter passes on what it is sent *adapter_ns* later.
+    """
     chosen = controller(name)
     config = chosen.board.config(referenced=True, **chosen.setup(wanted))
     board = chosen.board.make(lens, config, seed=seed, begin_ns=clock.now_ns())
-    return MemoryPort(board, clock), chosen.table(wanted)
+    return MemoryPort(board, clock, latency_ns=adapter_ns), chosen.table(wanted)

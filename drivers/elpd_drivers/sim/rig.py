@@ -68,8 +68,8 @@ class SimSettings:
     the light, and with it photoreceptor lag and shot noise; ``lag_us`` is the photoreceptors' time constant in full
     light, ``mismatch`` the relative spread of the contrast thresholds over pixels. ``cam`` makes the image move by 1 ±
     that many times as much as the carriage, one wave over the travel; ``steps_to_um`` is the ruler that its owner
-    believes in. With ``iris_steps`` the aperture is an iris on another axis of the lens's board (scf4, tmcl or
-    zaber), with so many microsteps from stop to stop, turned at ``iris_speed_sps``. Focus moves along the
+    believes in. With ``iris_steps`` the aperture is an iris on another axis of the lens's board (scf4, theia,
+    tmcl or zaber), with so many microsteps from stop to stop, turned at ``iris_speed_sps``. Focus moves along the
     travel by ``drift_um_s``. With ``sync_steps`` the board's sync line, which makes an edge at every multiple of so
     many steps, is wired to the camera's trigger input, unless ``sync_cut``.
 
@@ -424,7 +424,7 @@ def _lens(
     if iris is not None:
         if not isinstance(port.wire.board, TurnsIris):
             raise ConfigError(
-                f"sim.iris_steps: the board {chosen.board!r} has no second axis here; scf4, tmcl and zaber have"
+                f"sim.iris_steps: the board {chosen.board!r} has no second axis here; scf4, theia, tmcl and zaber have"
             )
         port.wire.board.add_iris(iris)
         table = {**table, "iris_axis": port.wire.board.iris_axis, "iris_open": chosen.iris_steps}

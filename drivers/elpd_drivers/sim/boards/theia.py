@@ -1,4 +1,4 @@
-"""A Theia MCR600 board with its focus motor in front of a simulated lens.
+"""A Theia MCR600 board with its focus motor in front of a simulated lens, and its iris motor, if there is an iris.
 
 What matters to whoever drives one: nothing is read while a motor moves, so nothing stops it; a motion is answered when
 it is over; the board counts no steps; it ends a motion at a switch that it was told to respect, and does not say so;
@@ -16,11 +16,13 @@ from elpd.units import NS_PER_S, NS_PER_US
 from elpd_drivers.lenses import theia_wire as wire
 from elpd_drivers.sim.boards.agenda import Agenda
 from elpd_drivers.sim.boards.axis import Axis
+from elpd_drivers.sim.boards.iris_motor import IrisMotor
 from elpd_drivers.sim.boards.served import ServedBoard
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd_drivers.sim.aperture import StepperIris
     from elpd_drivers.sim.lens import SimulatedLens
 
 AT_ONCE_SPS2 = 1e10
@@ -71,6 +73,17 @@ class TheiaBoard:
         self._output: list[tuple[int, bytes]] = []
         self._setups: dict[int, bytes] = {}
         self._busy = False
+        self.iris_motor: IrisMotor | None = None
+        """Motor 3, if it turns an iris."""
+
+    # --- the iris --------------------------------------------------------------------------------------------------
+
+    iris_axis = 3
+    """Which of its motors that is."""
+
+    def add_iris(self, iris: StepperIris) -> None:
+        """Put an iris on motor 3."""
+        self.iris_motor = IrisMotor(iris)
 
     # --- the wire's side -------------------------------------------------------------------------------------------
 
@@ -105,6 +118,8 @@ class TheiaBoard:
         """Let the supply brown out at *at_ns*: motor halted, nothing said."""
         self.advance_to(at_ns)
         self.lens.halt(at_ns)
+        if self.iris_motor is not None:
+            self.iris_motor.halt(at_ns)
         self._agenda.clear()
         self._partial.clear()
         self._busy = False
@@ -139,6 +154,9 @@ class TheiaBoard:
         if setup is None or not slowest <= pace <= fastest:
             self._say(at_ns, wire.DONE, 1)
             return
+        if message[1] == self.iris_axis and self.iris_motor is not None:
+            closing = message[0] == wire.FORWARD
+            self.iris_motor.move_to(at_ns, self.iris_motor.count_at(at_ns) + (-steps if closing else steps), pace)
         if message[1] != 1:  # another motor than the one that turns the lens
             self._after(at_ns, steps / pace, self._done)
             return
