@@ -217,6 +217,11 @@ class Aftermath:
         return self._passes.estimate(settings.play)
 
     @property
+    def pairs_begin_um(self) -> float:
+        """How far before focus most mirror pairs begin."""
+        return self._passes.begin_um
+
+    @property
     def flat(self) -> bool | None:
         """Whether the region of a still scene is at one depth, by passes there and back; ``None``: not known."""
         return self._passes.flat

@@ -10,7 +10,8 @@ import numpy as np
 
 from elpd.units import SensorUs
 from elpd.vision.drift import find_drift
-from elpd.vision.relief import is_flat
+from elpd.vision.pair_focus import PAIRS_REACH
+from elpd.vision.relief import Parts, is_flat
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
 from elpd.vision.witness import frame_witness, fuse, lamp_witness
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
-    from elpd.vision.relief import Parts
     from elpd.vision.track import Sharpness
     from elpd.vision.witness import EventWitnesses, Witness
 
@@ -65,6 +65,8 @@ class Testimony:
     """Such a scene at its sharpest, (height, width) in thresholds: where it lay in this pass."""
     parts: Parts | None = None
     """Where the parts of such a region turned."""
+    begin_um: float = 0.0
+    """How far before focus most of its pairs began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +124,10 @@ class Pass:
             for one in said.witnesses(unexplained, self.width_um)
         ]
         seen = [] if said.depths or frames is None else [frames.witness]  # of several planes frames show a mixture
-        return Testimony(
-            (*seen, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest(), said.parts
-        )
+        told = Testimony((*seen, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
+        if said.turns is None:
+            return told
+        return replace(told, parts=Parts.of(said.turns, PAIRS_REACH * self.width_um), begin_um=said.turns.begin)
 
     def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
         """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
@@ -204,6 +207,8 @@ class Passes:
         """Whether any of them saw the scene move."""
         self.deaf: Refractory | None = None
         """How long pixels are deaf after an event, by the first of them."""
+        self.begin_um = 0.0
+        """How far before focus most pairs begin, as far as has been seen."""
         self.flat: bool | None = None
         """Whether the region of a scene that stands still is at one depth; ``None`` where that is not known."""
 
@@ -219,6 +224,7 @@ class Passes:
         if said.scene_moves or self._moved_between():
             self.take_for_moving()
         self.deaf = self.deaf or said.deaf
+        self.begin_um = max(self.begin_um, said.begin_um)
         self.flat = None if self.scene_moves or self.depths_um else self._told_flat(flat_within_um)
 
     def _told_flat(self, within_um: float) -> bool | None:
@@ -264,7 +270,7 @@ class Passes:
             alike = [other for other, _ in said if other.name == one.name]
             freed, shared = (float(np.mean([getattr(other, key) for other in alike])) for key in ("freed", "shared"))
             even = one.with_lag(freed, shared)
-            evened.append((replace(even, astray=0.0) if self.flat else even, sign))
+            evened.append((replace(even, astray=even.apart) if self.flat else even, sign))
         return evened
 
     def estimate(self, play: Play) -> FocusEstimate | None:

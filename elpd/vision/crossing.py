@@ -178,7 +178,7 @@ def ask_events(
         LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12),
         drift=drift,
         expected_lag=expected,
-        parts=late.parts,
+        turns=late.turns,
         in_focus=light.focused,
         pairs_lag=pairs_lag.at,
     )

@@ -11,7 +11,6 @@ import numpy as np
 from elpd.vision.astigmatism import directions
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
 from elpd.vision.pairs import Mode, Pairs, weighted_mode
-from elpd.vision.relief import Parts
 from elpd.vision.turns import Slowness, Turns, blocks_of
 from elpd.vision.witness import stray_share
 
@@ -55,8 +54,8 @@ class Lateness:
     """The same if no pair had been asked."""
     towards: NDArray[np.float64]
     """Where the edges point whose pairs agree: the means of cos 2θ and sin 2θ, (2,)."""
-    parts: Parts | None = None
-    """Where the blocks of the region turn."""
+    turns: Turns | None = None
+    """The pairs that were asked."""
 
 
 def pair_mode(
@@ -115,7 +114,7 @@ def pair_mode(
     nothing = lag_of(None, unmeasured_lag / usual[0], calibrated)
     unasked = Lag(usual[0] * nothing.at, usual[0] * nothing.sigma)
     towards = np.average(directions(level)[y, x], axis=0, weights=turns.near)
-    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked, towards, Parts.of(turns))
+    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked, towards, turns)
 
 
 def as_known(lags: list[Lag]) -> Lag:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from elpd.vision.pairs import weighted_mode
 from elpd.vision.turns import BLOCKS
 
 if TYPE_CHECKING:
@@ -39,6 +40,11 @@ _QUARTER_OF = np.array(
 )
 _GROUPS = [np.flatnonzero(np.arange(_FINE) == k) for k in range(_FINE)]
 _GROUPS += [np.flatnonzero(np.equal(_QUARTER_OF, k)) for k in range(_QUARTERS)]
+_ROW, _COLUMN = np.divmod(np.arange(_FINE), BLOCKS)
+_HALVES = [
+    *(one // (BLOCKS // 2) == 0 for one in (_ROW, _COLUMN)),
+    *(one % 2 == 0 for one in (_ROW, _COLUMN, _ROW + _COLUMN)),
+]
 _GRIDS = (slice(0, _FINE), slice(_FINE, None))
 
 
@@ -54,13 +60,16 @@ class Parts:
     sigma: NDArray[np.float64]
 
     @classmethod
-    def of(cls, turns: Turns) -> Parts:
-        """Return the weighted medians of the parts' midpoints; no pair counts for more than a typical one."""
+    def of(cls, turns: Turns, reach: float) -> Parts:
+        """Return the weighted medians of the parts' midpoints within *reach* of the mode.
+
+        No pair counts for more than a typical one.
+        """
         at, sigma = np.zeros(len(_GROUPS)), np.full(len(_GROUPS), np.inf)
-        near = (np.abs(turns.middle - turns.mode) <= turns.reach) & (turns.weights > 0.0)
+        near = (np.abs(turns.middle - turns.mode) <= reach) & (turns.weights > 0.0)
         if not near.any():
             return cls(at, sigma)
-        most, least = float(np.median(turns.weights[near])), LEAST_SPREAD * turns.reach
+        most, least = float(np.median(turns.weights[near])), LEAST_SPREAD * reach
         for part, blocks in enumerate(_GROUPS):
             here = near & np.isin(turns.block, blocks)
             if int(here.sum()) < FEWEST_PAIRS:
@@ -81,6 +90,20 @@ class Parts:
         at[known] = (precision * np.array([one.at for one in passes])).sum(axis=0)[known] / total[known]
         sigma[known] = 1.0 / np.sqrt(total[known])
         return cls(at, sigma)
+
+
+def halves_apart(turns: Turns) -> float:
+    """Return the error of the pairs' mode by how far apart halves of the region put it: a standard deviation.
+
+    The mode of few pairs that lie far and wide is any of several heaps, whatever the spread of that one heap says.
+    """
+    squares = []
+    for half in _HALVES:
+        inside = half[turns.block]
+        one, other = (weighted_mode(turns.middle[part], turns.weights[part], turns.width) for part in (inside, ~inside))
+        if one is not None and other is not None:
+            squares.append((one.at - other.at) ** 2)
+    return 0.5 * float(np.sqrt(np.mean(squares))) if squares else np.inf
 
 
 def is_flat(there: Sequence[Parts], back: Sequence[Parts], within: float) -> bool | None:
@@ -107,10 +130,13 @@ def is_flat(there: Sequence[Parts], back: Sequence[Parts], within: float) -> boo
     off = places - float(weights @ places) / total
     free = weights * (1.0 - weights / total)
     between = float(weights @ np.square(off) - free @ errors) / float(free.sum())
-    doubt = float(np.sqrt(2.0 * np.square(weights * (errors + max(between, 0.0))).sum())) / float(free.sum())
-    if between - doubt > within**2:
+
+    def doubt(variance: float) -> float:
+        return float(np.sqrt(2.0 * np.square(weights * (errors + variance)).sum())) / float(free.sum())
+
+    if between > within**2 + doubt(within**2):  # so much even if it were just flat
         return False
-    return True if between + doubt <= within**2 else None
+    return True if between + doubt(max(between, 0.0)) <= within**2 else None
 
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:

@@ -19,6 +19,7 @@ from elpd.records import FocusEstimate
 from elpd.vision.drift import Drift
 from elpd.vision.lag import Lag
 from elpd.vision.planes import MIN_PAIRS
+from elpd.vision.relief import halves_apart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from elpd.vision.bands import BandFocus
     from elpd.vision.integral import Vertex
     from elpd.vision.pairs import Mode
-    from elpd.vision.relief import Parts
+    from elpd.vision.turns import Turns
 
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
@@ -79,6 +80,8 @@ class Witness:
     """How much lag was taken off ``at``."""
     astray: float = 0.0
     """What pairs that turn elsewhere add to the error: a region with several depths would have them, or motion."""
+    apart: float = 0.0
+    """What it is in a region that is known to be flat: how far apart halves of it put their modes."""
 
     @property
     def total_sigma(self) -> float:
@@ -121,8 +124,8 @@ class EventWitnesses:
     """What the image would have been freed of if no pair had been asked."""
     pairs_lag: float = 0.0
     """What the pairs were freed of: they need not be of the pixels that the image shows."""
-    parts: Parts | None = None
-    """Where the blocks of the region turn, by their pairs."""
+    turns: Turns | None = None
+    """The pairs themselves, as they were asked."""
     in_focus: bool = False
     """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
@@ -151,7 +154,9 @@ class EventWitnesses:
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
             parts = [self.pairs.sigma, SYSTEMATIC_PAIRS * width, PAIRS_DEPART * departure]
             sigma, astray = float(np.linalg.norm(parts)), stray * width
-            found.append(Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag, astray=astray))
+            apart = 0.0 if self.turns is None else halves_apart(self.turns)
+            pairs = Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag, astray=astray, apart=apart)
+            found.append(pairs)
         return found
 
 
