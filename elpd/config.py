@@ -69,6 +69,8 @@ class FocusSection(_Section):
     preset_um: float | None = None
     transmittance: Literal["profile", "linear", "iris"] = "profile"
     """``profile`` asks the aperture for its own."""
+    background_activity_us: Annotated[int, Field(ge=0)] = 0
+    """An event of a sweep counts only if another pixel of its 2x2 cell fired at most so long before; 0: all count."""
 
 
 class JournalSection(_Section):

@@ -249,7 +249,8 @@ class ElpSample:
     """One window of the Event Laplacian Product, ``ELP = -Σ p·w(x, y)`` over the events in ``[begin_us, end_us)``.
 
     All sums are exact integers. ``elp`` has the units of the weight table, ``energy`` is ``Σ w²`` over the same
-    events, ``n_on`` and ``n_off`` count events inside the ROI, ``n_capped`` those that a pixel's rate cap refused.
+    events, ``n_on`` and ``n_off`` count events inside the ROI, ``n_capped`` those that a filter refused: a pixel's
+    rate cap, or that of background activity where it is on.
     ``position_um`` is the lens position at the middle of the window and ``travel_um`` how far it moved in it, both
     ``nan`` where no lens path is known. ``shed_us`` of the window were not looked at, because too much was waiting.
     """

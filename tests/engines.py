@@ -69,6 +69,7 @@ class Daemon:
         *overrides: str,
         build: Callable[[Config], RigParts] = rig.build,
         small: bool = True,
+        prepare: Callable[[Config], None] = lambda _: None,
     ) -> None:
         self.directory = directory
         self._overrides = (
@@ -82,7 +83,7 @@ class Daemon:
         self.asked: list[Asked] = []
         self._build = build
         self.time = VirtualTime()
-        self.engine = RigEngine(self.config(), self.time, build=self._built)
+        self.engine = RigEngine(self.config(), self.time, build=self._built, prepare=prepare)
         self.engine.listen(self.events.append)
 
     def config(self, *overrides: str) -> Config:

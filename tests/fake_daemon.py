@@ -148,7 +148,7 @@ class FakeDaemon:
             }
             | fields
         ).model_dump(mode="json")  # fmt: skip
-        kept = {key: result[key] for key in ("outcome", "reason", "focus_um", "sigma_um", "duration_ms")}
+        kept = {key: result[key] for key in ("outcome", "reason", "focus_um", "sigma_um", "final_um", "duration_ms")}
         self.runs.insert(0, {"name": name, "at": "2026-11-22T22:43:06Z", "kept": False, **kept})
         self.last = result
         self.moving = False

@@ -194,14 +194,23 @@ def decode_arrays(t: Any, x: Any, y: Any, p: Any, width: int, height: int) -> An
 # --- events: ELP windows -------------------------------------------------------------------------------------------
 
 
+def alone(last_of_cell: dict[tuple[int, int], tuple[int, int, int]], t: int, x: int, y: int, support_us: int) -> bool:
+    """Say whether no other pixel of a cell of 2x2 was its last to fire, at most so long ago; remember this event."""
+    last = last_of_cell.get((x // 2, y // 2))
+    last_of_cell[x // 2, y // 2] = (t, x, y)
+    return last is None or t - last[0] > support_us or last[1:] == (x, y)
+
+
 def elp_windows(
-    items: Any, weights: Any, inside: Any, edges: Any, *, rate_cap: bool = False, sums: Any = (0, 0, 0, 0, 0)
-) -> Any:
+    items: Any, weights: Any, inside: Any, edges: Any, *, rate_cap: bool = False, support_us: int = 0,
+    sums: Any = (0, 0, 0, 0, 0)
+) -> Any:  # fmt: skip
     """Return closed rows (begin, end, elp, energy, n_on, n_off, n_capped) and what went nowhere."""
     rows, nowhere = [], Counter()
     sums = list(sums)
     cursor = -1  # the open window begins at edges[cursor]
     ready_us = defaultdict(lambda: None)
+    last_of_cell: dict[tuple[int, int], tuple[int, int, int]] = {}
     for item in items:
         kind, t = item[0], item[1]
         if kind == "trigger":
@@ -230,6 +239,9 @@ def elp_windows(
                 sums[4] += 1
                 continue
             ready_us[x, y] = ready + 625
+        if support_us and alone(last_of_cell, t, x, y, support_us):
+            sums[4] += 1
+            continue
         weight = int(weights[y, x])
         sums[0] -= weight if on else -weight
         sums[1] += weight * weight

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of the kernels in ``elpd.vision.first_events``: loops and lists, nothing clever."""
+"""Slow, obvious twins of the kernels of ``elpd.vision.latch`` and ``first_times``: loops and lists, nothing clever."""
 
 from __future__ import annotations
 

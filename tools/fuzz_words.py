@@ -4,9 +4,9 @@
 
 Nothing may crash, nothing may be written outside the arrays that a kernel was given (each lies between guards of a
 known value), and all kernels of an encoding must agree to the bit: sums, windows, counters, decoder registers, buckets
-of the rate cap, and decoded columns. Random words reach every branch; damaged recordings (bits flipped, words lost,
-doubled, moved, overwritten with zeros, ones or padding) reach the long runs that random words never make. Prints one
-line per kind of stream; exits 1 at the first difference, with the seed that shows it again.
+of the rate cap, decoded columns and, of EVT3, first ON times. Random words reach every branch; damaged recordings (bits
+flipped, words lost, doubled, moved, overwritten with zeros, ones or padding) reach the long runs that random words
+never make. Prints one line per kind of stream; exits 1 at the first difference, with the seed that shows it again.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.events import registers
 from elpd.events.evt2 import decode_evt2, decode_evt21
 from elpd.events.evt3 import decode
 from elpd.events.evt3_lists import EVENTS, LISTS
-from elpd.events.registers import new_state
 from elpd.events.simd import available
 from elpd.events.stream import open_recording
 from elpd.records import Encoding
 from elpd.vision import elp_addresses, elp_lanes, elp_words
 from elpd.vision.elp_weights import STRIDE, weight_table
 from elpd.vision.elp_windows import NEVER, new_window
+from elpd.vision.latch import EMPTY, new_latch
+from elpd.vision.latch_lanes import latch_kernel, scratch
+from elpd.vision.latch_words import evt3_to_latch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,6 +43,7 @@ GUARD_VALUE = 77
 PIECE = 40_000
 WIDTH, HEIGHT = 1280, 720
 WINDOWS_US = np.arange(4096) * 5000
+INTERVAL_US = (5_000_000, 1 << 30)
 DTYPES = {Encoding.EVT3: np.uint16, Encoding.EVT2: np.uint32, Encoding.EVT21: np.uint64}
 KERNELS: dict[Encoding, list[tuple[Callable[..., int], Callable[..., int]]]] = {
     Encoding.EVT3: [(elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped), elp_lanes.kernels()],
@@ -163,6 +167,8 @@ def run(words: NDArray[Any], encoding: Encoding, rng: np.random.Generator) -> in
         agree("windows" + " with the rate cap" * capped, seen)
     columns = [decoded(kernel, words, cuts) for kernel in DECODERS[encoding]]
     agree("columns", columns)
+    if encoding is Encoding.EVT3:
+        agree("first ON times", [first_times(kernel, words, cuts) for kernel in (evt3_to_latch, latch_kernel())])
     return int(columns[0][0].size)
 
 
@@ -180,7 +186,7 @@ def windows(
     """Sum a stream; return everything that the kernel leaves behind."""
     table = Guarded.of(table)
     own = {
-        "state": Guarded.of(new_state()),
+        "state": Guarded.of(registers.new_state()),
         "triggers": Guarded.of(np.zeros((16, 3), np.int64)),
         "window": Guarded.of(new_window()),
         "rows": Guarded.of(np.zeros((WINDOWS_US.size, 7), np.int64)),
@@ -201,7 +207,7 @@ def windows(
 
 def decoded(kernel: Callable[..., tuple[int, int]], words: NDArray[Any], cuts: NDArray[np.int64]) -> list[NDArray[Any]]:
     """Decode a stream; return its columns and registers."""
-    state, triggers = Guarded.of(new_state()), Guarded.of(np.zeros((16, 3), np.int64))
+    state, triggers = Guarded.of(registers.new_state()), Guarded.of(np.zeros((16, 3), np.int64))
     room = EVENTS + 64
     out = [Guarded.of(np.zeros(room, dtype)) for dtype in (np.int64, np.uint16, np.uint16, np.uint8)]
     is_blocks = available() and kernel is decode_blocks
@@ -220,6 +226,26 @@ def decoded(kernel: Callable[..., tuple[int, int]], words: NDArray[Any], cuts: N
         one.check("decoder")
     empty = [np.zeros(0, np.int64)]
     return [*(np.concatenate(column or empty) for column in columns), state.inner.copy(), triggers.inner.copy()]
+
+
+def first_times(kernel: Callable[..., None], words: NDArray[Any], cuts: NDArray[np.int64]) -> list[NDArray[Any]]:
+    """Latch a stream, some of it outside the interval; return everything that the kernel leaves behind."""
+    latch = [Guarded.of(one) for one in new_latch(WIDTH, HEIGHT)]
+    memory = [Guarded.of(one) for one in scratch()]
+    state, triggers = Guarded.of(registers.new_state()), Guarded.of(np.zeros((16, 3), np.int64))
+    for piece in np.split(words, cuts):
+        kernel(
+            piece, 0, state.inner, triggers.inner, *INTERVAL_US, WIDTH, HEIGHT, *(one.inner for one in latch),
+            *(one.inner for one in memory),
+        )  # fmt: skip
+    for one in (state, triggers, *latch, *memory):
+        one.check("first ON times")
+    slots, full, *counted = (one.inner for one in latch)
+    has_all = (slots.reshape(3, -1) != EMPTY).all(axis=0).reshape(-1, 32)
+    if ((full[:, None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool) & ~has_all).any():
+        raise Broken("a pixel that has room is said to be full")
+    not_ours = [registers.EVENTS, registers.X_OUT_OF_RANGE, registers.Y_OUT_OF_RANGE]  # the latch counts by itself
+    return [slots, *counted, np.delete(state.inner, not_ours)]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Meet each misfortune many times on the simulated rig and count what comes of it; above all: false FOCUSED.
 
-    python tools/guards.py [--only "NAME;NAME"] [--seeds 20] [--first 0] [--json FILE] [--list]
+    python tools/guards.py [--only "NAME;NAME"] [--seeds 20] [--first 0] [--set KEY=VALUE ...] [--json FILE] [--list]
 
 A seed is a scene, a place of focus, a set of sensor imperfections, and a side to start from (even: below, odd: above).
 ``right`` is FOCUSED with the glass at rest within one depth of focus of true focus (of the plane that the sweep met
@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from elpd import rig
 from elpd.config import load
@@ -26,6 +26,9 @@ from elpd.focus.cycle import FocusCycle
 from elpd.focus.fields import result_fields
 from elpd.focus.settings import CycleSettings, FocusRequest
 from elpd.records import Roi
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 WIDTH, HEIGHT = 200, 160
 DAVIS = ("sim.camera=davis346", f"sim.width={WIDTH}", f"sim.height={HEIGHT}", "focus.roi_fraction=0.6")
@@ -103,6 +106,7 @@ def main() -> int:
     parser.add_argument("--only", help="names, separated by semicolons")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the configuration")
     parser.add_argument("--json", type=Path, help="write every cycle to this file, one object a line")
     parser.add_argument("--list", action="store_true", help="say what there is, and stop")
     chosen = parser.parse_args()
@@ -119,7 +123,7 @@ def main() -> int:
     for name in names:
         count = Count()
         for seed in range(chosen.first, chosen.first + chosen.seeds):
-            row = meet(GUARDS[name], seed)
+            row = meet(GUARDS[name], seed, chosen.set)
             _add(count, row)
             if out is not None:
                 print(json.dumps({"misfortune": name, **row}), file=out, flush=True)
@@ -130,10 +134,10 @@ def main() -> int:
     return int(false > 0)
 
 
-def meet(guard: Guard, seed: int) -> dict[str, Any]:
-    """Run one cycle; return its result, how far from focus the glass rests, and the CPU time it took."""
+def meet(guard: Guard, seed: int, chosen: Sequence[str] = ()) -> dict[str, Any]:
+    """Run one cycle, with *chosen* keys set; return its result, the error of the resting glass, and its CPU time."""
     start_um = 200.0 if seed % 2 else -200.0
-    keys = [*guard.base, *guard.keys, f"sim.seed={seed}", f"sim.start_um={start_um}", "journal.enabled=false"]
+    keys = [*guard.base, *guard.keys, f"sim.seed={seed}", f"sim.start_um={start_um}", "journal.enabled=false", *chosen]
     config = load(overrides=keys)
     begun = time.process_time()
     parts = rig.build(config)

@@ -23,7 +23,7 @@ from elpd_drivers.formats.raw_write import write_raw
 from speed import stream
 from speed.contender import Contender, Missing, race, ratio
 from speed.ours import ours
-from speed.peers import DECODERS, FRAME, LOOP, peers
+from speed.peers import DECODERS, FRAME, LOOP, SIGNED, peers
 
 from elpd.errors import ElpdError
 from elpd.events.simd import instructions
@@ -36,9 +36,11 @@ RATIOS = {
     "fused_simd_vs_numpy_event_frame": ("elpd fused simd", FRAME),
     "decode_vs_best_peer": ("elpd decode", "best peer"),
     "fused_scalar_vs_numpy_event_frame": ("elpd fused scalar", FRAME),
+    "fused_simd_vs_signed_frame": ("elpd fused simd", SIGNED),
     "fused_simd_vs_paper_loop": ("elpd fused simd", LOOP),
     "fused_simd_vs_fused_scalar": ("elpd fused simd", "elpd fused scalar"),
     "fused_simd_vs_memcpy": ("elpd fused simd", "memcpy"),
+    "first_events_vs_decoded": ("elpd first events", "elpd first events, decoded"),
 }
 PER_EVENT = {"arrays_vs_best_peer_decode": ("elpd arrays to ELP", "best peer")}
 """Ratios of events, not of bytes, per second: the contenders read different encodings."""
@@ -135,15 +137,15 @@ def tell(answer: dict[str, Any]) -> None:
     print(f"{answer['file']}, {size}, {answer['rounds']} rounds, CPU time, {answer['simd'] or 'no SIMD'}")
     for row in answer["rows"]:
         if row["mb_s"] is None:
-            print(f"{row['name']:<36}  none: {row['reason']}")
+            print(f"{row['name']:<47}  none: {row['reason']}")
         else:
-            print(f"{row['name']:<36}{row['mb_s']:>9.0f} MB/s{row['mev_s']:>9.1f} Mev/s")
+            print(f"{row['name']:<47}{row['mb_s']:>9.0f} MB/s{row['mev_s']:>9.1f} Mev/s")
     for name, value in answer["ratios"].items():
         if value is None:
-            print(f"{name:<36}  none: {answer['reasons'][name]}")
+            print(f"{name:<47}  none: {answer['reasons'][name]}")
         else:
             least, most = answer["spreads"][name]
-            print(f"{name:<36}{value:>9.2f}   ({least:.2f} to {most:.2f})")
+            print(f"{name:<47}{value:>9.2f}   ({least:.2f} to {most:.2f})")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from elpd.records import Geometry, Roi
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from elpd.config import Config
+
 MAX_SIDE = 2048
 """The most pixels of any sensor's side: addresses have 11 bits."""
 
@@ -64,6 +66,12 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, previous)
 
 
+def run_folder(run: Path, config: Config) -> Path:
+    """Return the folder of a run that was named as a person does: by its path, or as `elpd runs` lists it."""
+    kept = config.journal.directory / run
+    return kept if not run.exists() and kept.exists() else run
+
+
 def parse_roi(text: str | None) -> Roi | None:
     """Read ``X,Y,W,H``. Whether it fits the sensor is for those to say who know the sensor."""
     if text is None:
@@ -71,7 +79,7 @@ def parse_roi(text: str | None) -> Roi | None:
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--roi is X,Y,W,H in whole pixels, such as 100,80,200,200; got {text!r}") from None
+        raise UsageError(f"a region is X,Y,W,H in whole pixels, such as 100,80,200,200; got {text!r}") from None
     return Roi(x, y, width, height)
 
 

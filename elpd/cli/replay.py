@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from elpd.cli.common import config_options, json_option, print_json
+from elpd.cli.common import config_options, json_option, print_json, run_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -23,15 +23,16 @@ if TYPE_CHECKING:
 @config_options
 @json_option
 def command(*, run: Path, config_path: Path | None, overrides: tuple[str, ...], as_json: bool) -> int:
-    """Run the cycle recorded in the folder RUN again: exit 0 if it is identical byte for byte, 1 if not.
+    """Run the recorded cycle RUN again: exit 0 if it is identical byte for byte, 1 if not.
 
-    RUN is a folder that `elpd focus` or `elpd demo` wrote. No device is touched and nothing is written.
+    RUN is a folder that a cycle wrote, or a name that `elpd runs` lists, of the folder journal.directory. No device is
+    touched and nothing is written.
     """
     from elpd.config import load  # noqa: PLC0415
     from elpd.record.replay import load_run, replay_run  # noqa: PLC0415  (numpy and numba only now)
 
-    load(config_path, overrides)  # every command takes them; the cycle runs by the configuration it was recorded with
-    recorded = load_run(run)
+    config = load(config_path, overrides)  # says where runs lie; the cycle runs by the one it was recorded with
+    recorded = load_run(run_folder(run, config))
     report = replay_run(recorded, run_cycle)
     if as_json:
         print_json(_fields(recorded, report))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from elpd.cli.common import config_options, json_option, print_json
+from elpd.cli.common import config_options, json_option, print_json, run_folder
 
 
 @click.command("report")
@@ -19,14 +19,15 @@ from elpd.cli.common import config_options, json_option, print_json
 def command(
     *, run: Path, out: Path | None, config_path: Path | None, overrides: tuple[str, ...], as_json: bool
 ) -> None:
-    """Write the run in the folder RUN as one self-contained HTML page: numbers, plots, picture, settings.
+    """Write the run RUN as one self-contained HTML page: numbers, plots, picture, settings.
 
-    The page has no script and loads nothing. The folder is only read.
+    RUN is a folder, or a name that `elpd runs` lists, of the folder journal.directory (runs/ unless set). The page has
+    no script and loads nothing. The folder is only read.
     """
     from elpd.config import load  # noqa: PLC0415
     from elpd.record.report import report_html  # noqa: PLC0415  (numpy, numba and cv2 only now)
 
-    load(config_path, overrides)  # every command takes them; a wrong key is wrong here too
+    run = run_folder(run, load(config_path, overrides))
     page = report_html(run)
     target = out or Path(f"{run.resolve().name}.html")
     target.write_text(page, encoding="utf-8")

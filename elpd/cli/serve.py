@@ -54,7 +54,11 @@ def command(*, config_path: Path | None, overrides: tuple[str, ...], as_json: bo
 
     sockets = handed_over(os.environ, os.getpid())
     place = Place()
-    engine = RigEngine(config, RealTime(place.wait), place, threaded=True)
+
+    def prepare(other: Config) -> None:
+        warm_up(other, lambda: engine.stopping)
+
+    engine = RigEngine(config, RealTime(place.wait), place, threaded=True, prepare=prepare)
     api = ApiServer(engine, config.api, sockets)
     threads = EngineThreads(engine, notifier, lambda: _schedule(engine, config))
     api.start()

@@ -265,7 +265,7 @@ class RecordAnswer(TypedDict):
 
 
 class RunSummary(TypedDict):
-    """One run of many. *at* is ISO 8601, UTC; *outcome* is ``None`` where an error ended it."""
+    """One run of many. *at* is ISO 8601, UTC; *outcome* is ``None`` where an error ended it; *final_um* is at rest."""
 
     name: str
     at: str | None
@@ -273,6 +273,7 @@ class RunSummary(TypedDict):
     reason: str | None
     focus_um: float | None
     sigma_um: float | None
+    final_um: float | None
     duration_ms: float | None
     kept: bool
 

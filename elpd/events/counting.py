@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from elpd.records import CameraPacket, Roi
 
 
-@kernel(f"int64({WORDS}, int64, int64[::1], int64, int64, int64, int64)")
+@kernel(f"int64({WORDS}, int64, int64[::1], int64, int64, int64, int64)", serves=Encoding.EVT3.value)
 def count_evt3(
     words: NDArray[np.uint16], position: int, state: NDArray[np.int64], x: int, y: int, width: int, height: int
 ) -> int:
@@ -75,7 +75,7 @@ def count_evt3(
     return int(inside)
 
 
-@kernel(f"int64({EVT2_WORDS}, int64, int64, int64, int64)")
+@kernel(f"int64({EVT2_WORDS}, int64, int64, int64, int64)", serves=Encoding.EVT2.value)
 def count_evt2(words: NDArray[np.uint32], x: int, y: int, width: int, height: int) -> int:
     """Return how many events lie in a region."""
     inside: Any = 0
@@ -86,7 +86,7 @@ def count_evt2(words: NDArray[np.uint32], x: int, y: int, width: int, height: in
     return int(inside)
 
 
-@kernel(f"int64({EVT21_WORDS}, int64, int64, int64, int64)")
+@kernel(f"int64({EVT21_WORDS}, int64, int64, int64, int64)", serves=Encoding.EVT21.value)
 def count_evt21(words: NDArray[np.uint64], x: int, y: int, width: int, height: int) -> int:
     """Return how many events lie in a region."""
     inside: Any = 0
@@ -133,7 +133,10 @@ if available():  # elsewhere it does not compile
             add(builder, inside, population(builder, there))
         return builder.load(inside)
 
-    @kernel(f"int64({WORDS}, int64[::1], int64[:, ::1], int64, int64, int64, int64, uint32[::1], int64[::1])")
+    @kernel(
+        f"int64({WORDS}, int64[::1], int64[:, ::1], int64, int64, int64, int64, uint32[::1], int64[::1])",
+        serves=Encoding.EVT3.value,
+    )
     def count_blocks(
         words: NDArray[np.uint16],
         state: NDArray[np.int64],

@@ -36,6 +36,7 @@ from elpd.events.registers import (
     Integer,
     hold_trigger,
 )
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -112,7 +113,7 @@ def take_rare_evt21_word(
         state[RESERVED] += 1
 
 
-@kernel(f"UniTuple(int64, 2)({EVT2_WORDS}, int64, int64[::1], int64, int64, {_OUTPUTS})")
+@kernel(f"UniTuple(int64, 2)({EVT2_WORDS}, int64, int64[::1], int64, int64, {_OUTPUTS})", serves=Encoding.EVT2.value)
 def decode_evt2(
     words: NDArray[np.uint32],
     position: int,
@@ -161,7 +162,7 @@ def decode_evt2(
     return position, n
 
 
-@kernel(f"UniTuple(int64, 2)({EVT21_WORDS}, int64, int64[::1], int64, int64, {_OUTPUTS})")
+@kernel(f"UniTuple(int64, 2)({EVT21_WORDS}, int64, int64[::1], int64, int64, {_OUTPUTS})", serves=Encoding.EVT21.value)
 def decode_evt21(
     words: NDArray[np.uint64],
     position: int,

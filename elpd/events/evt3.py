@@ -55,6 +55,7 @@ from elpd.events.registers import (
     Integer,
     hold_trigger,
 )
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,6 +63,9 @@ if TYPE_CHECKING:
     from elpd.records import Geometry
 
 EVENTS_PER_WORD = 12
+NEITHER_ROW_NOR_COLUMN = 0xD000
+"""Bits of a word's kind that ADDR_Y and ADDR_X have not."""
+
 WORDS = 'Array(uint16, 1, "C", readonly=True)'  # a writable array converts to it: one compilation for both
 
 
@@ -157,7 +161,8 @@ def skip_to_time(words: NDArray[np.uint16], position: int, state: NDArray[np.int
 
 @kernel(
     f"UniTuple(int64, 2)({WORDS}, int64, int64[::1], int64, int64, "
-    "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1])"
+    "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1])",
+    serves=Encoding.EVT3.value,
 )
 def decode(  # noqa: C901  (one function: calls cost)
     words: NDArray[np.uint16],
@@ -187,14 +192,26 @@ def decode(  # noqa: C901  (one function: calls cost)
     t = (loop << 24) + (high << 12) + low
     x_limit = width if row < height else 0
     room = out_t.shape[0] - EVENTS_PER_WORD
-    n = 0
-    y_out = 0
-    x_out = 0
+    n: Integer = 0
+    y_out: Integer = 0
+    x_out: Integer = 0
     i = np.uint64(position)
     size = np.uint64(words.shape[0])
     while i < size and n <= room:
         word = np.int64(words[i])
         i += np.uint64(1)
+        if word & NEITHER_ROW_NOR_COLUMN == 0:
+            # Which of the two it is nobody can predict: both are written, and a row is overwritten by what follows.
+            is_column = word >> 13
+            row = row if is_column else word
+            x_limit = width if row < height else 0
+            x = word & 0x7FF
+            out_t[n], out_x[n], out_y[n], out_p[n] = t, x, row, (word >> 11) & 1
+            is_inside = is_column & np.int64(x < x_limit)
+            n += is_inside
+            y_out += is_column & np.int64(x_limit == 0)
+            x_out += is_column & ~is_inside & np.int64(x_limit != 0)
+            continue
         kind = word >> 12
         if kind == 0x8:
             content = word & 0xFFF
@@ -215,8 +232,6 @@ def decode(  # noqa: C901  (one function: calls cost)
             if word >> 12 != 0x0:
                 continue
             i += np.uint64(1)
-            kind = np.int64(0x0)
-        if kind == 0x0:
             row = word
             x_limit = width if row < height else 0
             if i == size:
@@ -225,23 +240,18 @@ def decode(  # noqa: C901  (one function: calls cost)
             if word >> 12 != 0x2:
                 continue
             i += np.uint64(1)
-            kind = np.int64(0x2)
-            # After a row of one event a TIME_HIGH is often said again. It is stepped over, not branched on: nobody can
-            # predict it.
-            if i < size:
-                i += np.uint64(words[i] == 0x8000 | high)
-        if kind == 0x2:
             x = word & 0x7FF
             if x < x_limit:
-                out_t[n] = t
-                out_x[n] = x
-                out_y[n] = row
-                out_p[n] = (word >> 11) & 1
+                out_t[n], out_x[n], out_y[n], out_p[n] = t, x, row, (word >> 11) & 1
                 n += 1
             elif x_limit == 0:
                 y_out += 1
             else:
                 x_out += 1
+            # After a row of one event a TIME_HIGH is often said again. It is stepped over, not branched on, for the
+            # same reason.
+            if i < size:
+                i += np.uint64(words[i] == 0x8000 | high)
         elif kind == 0x3:
             vector_x = word & 0x7FF
             vector_on = (word >> 11) & 1
@@ -251,10 +261,7 @@ def decode(  # noqa: C901  (one function: calls cost)
                 x = vector_x + np.int64(trailing_zeros(mask))
                 mask = np.uint32(mask & (mask - np.uint32(1)))
                 if x < x_limit:
-                    out_t[n] = t
-                    out_x[n] = x
-                    out_y[n] = row
-                    out_p[n] = vector_on
+                    out_t[n], out_x[n], out_y[n], out_p[n] = t, x, row, vector_on
                     n += 1
                 elif x_limit == 0:
                     y_out += 1
@@ -269,4 +276,4 @@ def decode(  # noqa: C901  (one function: calls cost)
     state[EVENTS] += n
     state[Y_OUT_OF_RANGE] += y_out
     state[X_OUT_OF_RANGE] += x_out
-    return int(i), n
+    return int(i), int(n)

@@ -18,6 +18,7 @@ from elpd.events.lanes_columns import unpack
 from elpd.events.registers import EVENTS as EVENTS_SEEN
 from elpd.events.registers import HIGH, LOOP, X_OUT_OF_RANGE, Y_OUT_OF_RANGE
 from elpd.events.simd import available
+from elpd.records import Encoding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,7 +33,8 @@ if available():  # elsewhere it does not compile
 
     @kernel(
         f"UniTuple(int64, 2)({WORDS}, int64, int64[::1], int64, int64, "
-        "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1], uint32[::1], int64[::1])"
+        "int64[::1], uint16[::1], uint16[::1], uint8[::1], int64[:, ::1], uint32[::1], int64[::1])",
+        serves=Encoding.EVT3.value,
     )
     def decode_blocks(
         words: NDArray[np.uint16],

@@ -26,9 +26,18 @@ from elpd.events.evt3_lists import (
     LANE_ROWS,
     LEDGER,
     LOWS,
+    N_RUNS,
     PLACES,
     RANK,
     ROWS,
+    RUN,
+    RUN_LOW,
+    RUN_MASK,
+    RUN_ON,
+    RUN_RANK,
+    RUN_ROW,
+    RUN_X,
+    RUNS,
     SETTLED,
     STOPPED,
     X_COLUMNS,
@@ -110,7 +119,7 @@ def copy_x(lists: NDArray[np.uint32], begin: Any, end: Any, n: Any) -> None:
     copy_run(lists, X_LOWS + begin, lists, LOWS + n, end - begin)
 
 
-def _build_rest(timed: bool) -> Callable[..., Any]:  # noqa: FBT001  (a compile-time constant)
+def _build_rest(timed: bool, whole: bool = False) -> Callable[..., Any]:  # noqa: FBT001, FBT002  (compile-time constants)
     @kernel()
     def take_rest(
         words: NDArray[np.uint16],
@@ -151,17 +160,27 @@ def _build_rest(timed: bool) -> Callable[..., Any]:  # noqa: FBT001  (a compile-
                     now = content_before(words, place, position, 0x6, state[LOW])
                     take_rare_word(word, base + now, state, triggers)
             if width > 0:
+                rank: Any = 0
                 if timed:
                     block = lane // LANES * LEDGER
                     before = np.uint32((np.uint64(1) << np.uint64(lane % LANES)) - np.uint64(1))
                     rank = ledger[block + RANK] + count(np.uint32(ledger[block + X_MASK]) & before)
+                if whole:
+                    run = RUNS + n * RUN
+                    ledger[run + RUN_X], ledger[run + RUN_ON], ledger[run + RUN_MASK] = vector_x, vector_on, mask
+                    ledger[run + RUN_ROW] = entry(lists, LANE_ROWS + lane)
+                    ledger[run + RUN_LOW] = entry(lists, LANE_LOWS + lane)
+                    ledger[run + RUN_RANK] = rank
+                    n += 1
+                elif timed:
                     copy_x(lists, copied, rank, n)
                     n += rank - copied
                     copied = rank
                     fill_run(entry(lists, LANE_LOWS + lane), lists, LOWS + n)
-                pack_run(vector_x, vector_on, mask, lists, COLUMNS + n)
-                fill_run(entry(lists, LANE_ROWS + lane), lists, ROWS + n)
-                n += count(mask)
+                if not whole:
+                    pack_run(vector_x, vector_on, mask, lists, COLUMNS + n)
+                    fill_run(entry(lists, LANE_ROWS + lane), lists, ROWS + n)
+                    n += count(mask)
                 # A base outside every sensor need not grow: it would overflow in the end.
                 vector_x = min(vector_x + width, 2 * MAX_SIDE)
         state[VECTOR_X], state[VECTOR_ON] = vector_x, vector_on
@@ -173,9 +192,10 @@ def _build_rest(timed: bool) -> Callable[..., Any]:  # noqa: FBT001  (a compile-
 
 _take_rest = _build_rest(timed=False)
 _take_timed_rest = _build_rest(timed=True)
+_take_whole_rest = _build_rest(timed=True, whole=True)
 
 
-def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001  (a compile-time constant)
+def _build(timed: bool, whole: bool = False) -> Callable[..., tuple[int, int, bool]]:  # noqa: C901, FBT001, FBT002  (calls cost)
     @kernel()
     def take_blocks(
         words: NDArray[np.uint16],
@@ -252,11 +272,16 @@ def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001
             state[RATE_COUNTS] += n_counts
         n = 0 if timed else n_x
         if n_places > 0:
-            if timed:
+            if whole:
+                n = _take_whole_rest(words, position, state, triggers, n, n_places, lists, ledger)
+            elif timed:
                 n = _take_timed_rest(words, position, state, triggers, n, n_places, lists, ledger)
             else:
                 n = _take_rest(words, position, state, triggers, n, n_places, lists, ledger)
-        if timed:
+        if whole:
+            ledger[N_RUNS] = n
+            n = n_x
+        elif timed:
             copied = ledger[COPIED] if n_places > 0 else np.int64(0)
             copy_x(lists, copied, n_x, n)
             n += n_x - copied
@@ -274,3 +299,4 @@ def _build(timed: bool) -> Callable[..., tuple[int, int, bool]]:  # noqa: FBT001
 
 take_blocks = _build(timed=False)
 take_timed_blocks = _build(timed=True)
+take_whole_blocks = _build(timed=True, whole=True)

@@ -36,6 +36,12 @@ LISTS = (PLACES + LANE_WORDS) // 2
 """The size of the array."""
 
 X_MASK, RANK, LEDGER = 0, 1, 2
-STOPPED, COPIED, SETTLED = (BLOCKS * LEDGER + k for k in range(3))
-LEDGER_SIZE = BLOCKS * LEDGER + 3
+STOPPED, COPIED, SETTLED, N_RUNS = (BLOCKS * LEDGER + k for k in range(4))
+LEDGER_SIZE = BLOCKS * LEDGER + 4
 """A second array, of int64: of each block its ADDR_X words and how many came before; then what kernels tell others."""
+
+RUN_X, RUN_ON, RUN_MASK, RUN_ROW, RUN_LOW, RUN_RANK, RUN = range(7)
+RUNS = LEDGER_SIZE
+LEDGER_OF_RUNS = RUNS + RUN * LANE_WORDS
+"""Behind those, where vectors are kept whole: of each its first column, polarity, mask, row, low part of its time, and
+how many ADDR_X words came before it."""

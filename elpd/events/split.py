@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@kernel(f"int64({WORDS}, int64, int64[::1], int64, int64[:, ::1])")
+@kernel(f"int64({WORDS}, int64, int64[::1], int64, int64[:, ::1])", serves=Encoding.EVT3.value)
 def split_evt3(
     words: NDArray[np.uint16],
     position: int,
@@ -68,7 +68,7 @@ def split_evt3(
     return position
 
 
-@kernel(f"int64({EVT2_WORDS}, int64, int64[::1], int64, int64[:, ::1])")
+@kernel(f"int64({EVT2_WORDS}, int64, int64[::1], int64, int64[:, ::1])", serves=Encoding.EVT2.value)
 def split_evt2(
     words: NDArray[np.uint32],
     position: int,
@@ -94,7 +94,7 @@ def split_evt2(
     return position
 
 
-@kernel(f"int64({EVT21_WORDS}, int64, int64[::1], int64, int64[:, ::1])")
+@kernel(f"int64({EVT21_WORDS}, int64, int64[::1], int64, int64[:, ::1])", serves=Encoding.EVT21.value)
 def split_evt21(
     words: NDArray[np.uint64],
     position: int,

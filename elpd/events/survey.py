@@ -103,7 +103,7 @@ class Survey:
         self._state[OTHERS_SUBTYPE] = NO_SUBTYPE
 
 
-@kernel(f"void({WORDS}, int64[::1], int64[::1], int64[:, ::1])")
+@kernel(f"void({WORDS}, int64[::1], int64[::1], int64[:, ::1])", serves=Encoding.EVT3.value)
 def survey_evt3(
     words: NDArray[np.uint16], state: NDArray[np.int64], tally: NDArray[np.int64], triggers: NDArray[np.int64]
 ) -> None:

@@ -31,6 +31,10 @@ LOOK_BACK_DOF = 12.0
 AFTERMATH_DOF = 2.0
 """Travel beyond the decision whose events still count: pixels with little contrast answer late."""
 
+FLAT_DOF = 0.5
+"""How far the parts of a region may be in focus from one another, as a standard deviation, if one answer is to do for
+all: half a depth of focus."""
+
 LATE_DOF = 3.0
 """How late the events' own image is sharpest: its pixels answer 11 to 22 um after a focus 6 um deep (natural scenes).
 Too far on the way back costs less than not far enough."""
@@ -52,6 +56,8 @@ class WatchSettings:
     """Between motor and carriage."""
     frames: bool = False
     """Whether the reference is a frame, whose bright and dark are blurred, and not a temporal map."""
+    background_activity_us: int = 0
+    """Events of a sweep that no neighbour fired so shortly before are not heard; 0: all are."""
 
 
 class Aftermath:
@@ -113,6 +119,12 @@ class Aftermath:
         """Where the image was sharpest, in the last pass."""
         track = self._hearing.memory.track
         return self._course.leg.sign * track.positions[track.peak]
+
+    @property
+    def past_um(self) -> float:
+        """How far the lens has gone since then, in that pass."""
+        track = self._hearing.memory.track
+        return track.positions[-1] - track.positions[track.peak]
 
     def sharpest(self, focus_um: float, distance_um: float) -> Sharpest | None:
         """Return the picture in focus as the last pass saw it; ``None`` if it saw less than *distance_um* around it."""
@@ -200,13 +212,19 @@ class Aftermath:
             dark = DARK if settings.frames else DARK_OF_MAP
             said = one.testify(self._locate, hearing.reference.brightness, LAG_UNEXPLAINED_LIVE, dark)
         look_back_us = 1e6 * LOOK_BACK_DOF * settings.depth_of_focus_um / settings.speed_um_s
-        self._passes.add(said, course.leg.sign, (course.decided_us - look_back_us, course.decided_us))
+        near_us = (course.decided_us - look_back_us, course.decided_us)
+        self._passes.add(said, course.leg.sign, near_us, FLAT_DOF * settings.depth_of_focus_um)
         return self._passes.estimate(settings.play)
 
     @property
-    def lag_um(self) -> tuple[float, float]:
-        """How well the first pass knows its lag, and focus but for what makes events late, um."""
-        return self._passes.lag_um()
+    def pairs_begin_um(self) -> float:
+        """How far before focus most mirror pairs begin."""
+        return self._passes.begin_um
+
+    @property
+    def flat(self) -> bool | None:
+        """Whether the region of a still scene is at one depth, by passes there and back; ``None``: not known."""
+        return self._passes.flat
 
     def take_for_moving(self) -> None:
         """Take the scene for one that moves: of what has been said of it as still only what holds then is believed."""

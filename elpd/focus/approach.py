@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING
 
 from elpd.focus import safety
@@ -31,6 +32,9 @@ TURN_MS = 5.0
 
 RETURN_SIGMAS = 6.0
 """Under a lamp, how certainly the way back must have undone what the way out had done."""
+
+RETURN_SIGMAS_OF_NOISE = 3.0
+"""Of as many noise events, how certainly the way back made too few of the scene's."""
 
 RETURN_SHARE = 0.5
 """The way back leads over the same ground as the end of the way out, and beyond: half its events at the least.
@@ -172,8 +176,12 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, way: WayBack, re
     from_um = stage.position_um(watch.after.back_from_us)
     resting_hz, way_back_um = watch.resting_rate_hz, abs(from_um - focus_um)
     passed_s = (stage.now_ns() - stage.sensor_clock.to_host(watch.after.back_from_us)) / NS_PER_S
-    seen = watch.after.events_back - round(resting_hz * passed_s)
-    expected = watch.after.events_within(focus_um, from_um) - round(resting_hz * way_back_um / settings.speed_um_s)
+    out_s = way_back_um / settings.speed_um_s
+    back, out = watch.after.events_back, watch.after.events_within(focus_um, from_um)
+    seen, expected = back - round(resting_hz * passed_s), out - round(resting_hz * out_s)
+    # Events scatter by the root of their number, and the noise that is subtracted was learnt from a number too.
+    learnt = (resting_hz * (passed_s - RETURN_SHARE * out_s)) ** 2 / max(1, watch.resting_events)
+    chance = RETURN_SIGMAS_OF_NOISE * sqrt(back + RETURN_SHARE**2 * out + learnt)
     if score is not None and score >= RETURN_SIGMAS:
         return seen
     sharpened = watch.after.sharpened_again()
@@ -193,7 +201,7 @@ def verify(stage: Stage, watch: Watch, settings: CycleSettings, way: WayBack, re
                 "between motor and lens",
             )
         return seen
-    if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected:
+    if way_back_um > settings.depth_of_focus_um and seen < RETURN_SHARE * expected - chance:
         raise Ended(
             Outcome.LENS_DID_NOT_MOVE,
             f"the controller says that the lens went back {way_back_um:.0f} um, but the scene did not change "

@@ -44,7 +44,7 @@ from elpd.vision.reference import reference_from_frame
 from elpd.vision.resting import LISTEN_MS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from elpd.focus.picture import Picture
     from elpd.focus.settings import CycleSettings, FocusRequest
@@ -162,6 +162,11 @@ class FocusCycle:
         """The temporal map, once exposed, for whoever wants to store or show it."""
         return self._scene.map
 
+    @property
+    def delays(self) -> Mapping[str, tuple[float, ...]]:
+        """How old the newest packets were, us, by stage."""
+        return self._stage.delays.by_stage()
+
     # --- the line of phases ---
 
     def _focus(self) -> tuple[Outcome, str]:
@@ -216,6 +221,7 @@ class FocusCycle:
                 settings.depth_of_focus_um,
                 Play.up_to(settings.backlash_um),
                 frames=picture.map is None,
+                background_activity_us=settings.background_activity_us,
             ),
             self._stage.position_um,
             lambda frame: reference_from_frame(frame.pixels, roi),
@@ -229,6 +235,7 @@ class FocusCycle:
             self._stage.wait_ms(LISTEN_MS)
         self._stage.hear(safety.CAMERA_SILENCE_MS)
         watch.armed()
+        self._stage.lost_at_rest = self._stage.lost_events
         self._guard(watch)
         return watch
 
@@ -262,6 +269,7 @@ class FocusCycle:
             self._settings,
             self._deadline_ns,
             exposed=self.map is not None,
+            shown=self._request.reference is None and self._parts.aperture is None,
             sink=self._sink,
             enter=self._phase,
             observe=self._observe,

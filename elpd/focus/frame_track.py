@@ -8,11 +8,9 @@ from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.track import RISE, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from elpd.records import Frame, Roi
     from elpd.units import SensorUs
+    from elpd.vision.track import Sharpness
 
 
 class FrameTrack:
@@ -21,14 +19,14 @@ class FrameTrack:
     def __init__(self, roi: Roi, *, follow: bool) -> None:
         self._energy = FrameEnergy(roi, ROI_MARGIN_PX, follow=follow)
         self._track = PeakTrack()
-        self.seen: list[tuple[SensorUs, NDArray[np.float64]]] = []
-        """Each frame's time and log S in each band."""
+        self.seen: list[tuple[SensorUs, Sharpness]] = []
+        """Each frame's time and how sharp it is."""
 
     def take(self, frame: Frame, place: float) -> None:
         """Take a frame that was exposed with the lens at *place*, which rises along the pass."""
-        bands = self._energy.measure(frame.pixels)
-        self.seen.append((frame.t_us, bands))
-        self._track.add_bands(int(frame.t_us), place, bands)
+        sharpness = self._energy.measure(frame.pixels)
+        self.seen.append((frame.t_us, sharpness))
+        self._track.add_sharpness(int(frame.t_us), place, sharpness)
 
     @property
     def sharpens(self) -> bool:

@@ -49,6 +49,8 @@ class Hearing:
         What a calibration knows of the sensor.
     picture
         Makes the first picture, as ``Resting`` wants it.
+    support_us
+        Of the filter of background activity; 0: none.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Hearing:
         locate: Callable[[SensorUs], float],
         sensor: SensorProfile | None,
         picture: Callable[[], NDArray[np.float32]] | None,
+        support_us: int = 0,
     ) -> None:
         self.reference = reference
         """The weights that the region is judged by."""
@@ -90,12 +93,13 @@ class Hearing:
         self.roi = roi
         self._geometry = geometry
         self._sensor = sensor
+        self._support_us = support_us
         self._window_um = window_um
         self.window_us = max(20, round(1e6 * window_um / speed_um_s))
         self._windows: ElpWindows | None = None
         self._decoder = PacketDecoder(geometry)
         self._placed = Placed(locate)
-        self.memory = EventMemory(roi, geometry, sensor=sensor)
+        self.memory = EventMemory(roi, geometry, sensor=sensor, support_us=support_us)
         """The events of the present stretch of motion, and the image that they build."""
 
     # --- at rest ---
@@ -126,7 +130,9 @@ class Hearing:
             self.lamp.begin(at_us)
         if self._windows is None:
             weights = self.reference.weights
-            self._windows = ElpWindows(weights, self._inside, window_us=self.window_us, rate_cap=True)
+            self._windows = ElpWindows(
+                weights, self._inside, window_us=self.window_us, rate_cap=True, support_us=self._support_us
+            )
         self.begun_us = at_us
         self.gaps_us = []
         self.undoing = False
@@ -186,7 +192,8 @@ class Hearing:
         Built anew, it would begin with the negative of what the scene looked like where the lens turned, perhaps close
         to focus, and when the scene moves the difference of two sharp pictures is sharpest anywhere.
         """
-        self.memory = EventMemory(self.roi, self._geometry, hot=self.resting.hot, sensor=self._sensor, start=start)
+        hot, sensor, support_us = self.resting.hot, self._sensor, self._support_us
+        self.memory = EventMemory(self.roi, self._geometry, hot=hot, sensor=sensor, start=start, support_us=support_us)
 
     def _net(self, sample: ElpSample) -> ElpSample:
         if self.lamp is None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elpd.units import SensorUs
 from elpd.vision.drift import find_drift
+from elpd.vision.pair_focus import PAIRS_REACH
+from elpd.vision.relief import Parts, is_flat
 from elpd.vision.ruler import Ruler
 from elpd.vision.track import PeakTrack
 from elpd.vision.witness import frame_witness, fuse, lamp_witness
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
+    from elpd.vision.track import Sharpness
     from elpd.vision.witness import EventWitnesses, Witness
 
 PATH_STEP_US = 250
@@ -60,6 +63,19 @@ class Testimony:
     """What is left of a scene that was taken for still, should it turn out to move."""
     picture: NDArray[np.float32] | None = None
     """Such a scene at its sharpest, (height, width) in thresholds: where it lay in this pass."""
+    parts: Parts | None = None
+    """Where the parts of such a region turned."""
+    begin_um: float = 0.0
+    """How far before focus most of its pairs began."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    """Frames of a pass, their parabola as a witness, and its width."""
+
+    points: list[tuple[int, float, Sharpness]]
+    witness: Witness
+    width: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +83,7 @@ class Pass:
     """One stretch of motion over focus: what was seen, when it began and was over, which way and how fast it went."""
 
     memory: EventMemory
-    frames: Sequence[tuple[SensorUs, NDArray[np.float64]]]
+    frames: Sequence[tuple[SensorUs, Sharpness]]
     """Each frame's time and log S in each band."""
     begun_us: SensorUs
     end_us: SensorUs
@@ -99,16 +115,19 @@ class Pass:
         if said is None:
             return Testimony(tuple(self.ask_frames(locate)), deaf=deaf)
         undated_um = 1e-6 * self.speed_um_s * deaf.sigma_us
-        in_motion = replace(self, scene_moves=True)
-        moved = (*in_motion.ask_frames(locate), *self._in_motion(said, undated_um))
+        frames = self._fit_frames(locate)
+        moved = (*self._frames_in_motion(frames), *self._in_motion(said, undated_um))
         if self.scene_moves or (not said.depths and said.drift.seen):
             return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True)
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, undated_um)))
             for one in said.witnesses(unexplained, self.width_um)
         ]
-        frames = [] if said.depths else self.ask_frames(locate)  # of several planes frames show a mixture
-        return Testimony((*frames, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
+        seen = [] if said.depths or frames is None else [frames.witness]  # of several planes frames show a mixture
+        told = Testimony((*seen, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
+        if said.turns is None:
+            return told
+        return replace(told, parts=Parts.of(said.turns, PAIRS_REACH * self.width_um), begin_um=said.turns.begin)
 
     def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
         """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
@@ -135,16 +154,28 @@ class Pass:
 
     def ask_frames(self, locate: Callable[[SensorUs], float]) -> list[Witness]:
         """Ask the frames, where three or more saw focus come and go."""
+        frames = self._fit_frames(locate)
+        if self.scene_moves:
+            return self._frames_in_motion(frames)
+        return [] if frames is None else [frames.witness]
+
+    def _fit_frames(self, locate: Callable[[SensorUs], float]) -> _Frames | None:
         points = [(int(when), self.sign * locate(when), one) for when, one in self.frames if when <= self.end_us]
         track = _track_of(points)
         focus = track.focus() if track.passed else None
         if focus is None:
-            return []
+            return None
         witness = frame_witness(focus, float(np.median(np.diff(track.positions))))
-        if self.scene_moves:
-            doubt = float(np.hypot(FRAMES_IN_MOTION * focus.finest.width, _jackknife(points)))
-            witness = replace(witness, sigma=float(np.hypot(witness.sigma, doubt)))
-        return [witness] if np.isfinite(witness.sigma) else []
+        return _Frames(points, witness, focus.finest.width) if np.isfinite(witness.sigma) else None
+
+    @staticmethod
+    def _frames_in_motion(frames: _Frames | None) -> list[Witness]:
+        """Return what frames say of a scene that moves, if one of them does not carry it all."""
+        if frames is None:
+            return []
+        doubt = float(np.hypot(FRAMES_IN_MOTION * frames.width, _jackknife(frames.points)))
+        sigma = float(np.hypot(frames.witness.sigma, doubt))
+        return [replace(frames.witness, sigma=sigma)] if np.isfinite(sigma) else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,9 +207,16 @@ class Passes:
         """Whether any of them saw the scene move."""
         self.deaf: Refractory | None = None
         """How long pixels are deaf after an event, by the first of them."""
+        self.begin_um = 0.0
+        """How far before focus most pairs begin, as far as has been seen."""
+        self.flat: bool | None = None
+        """Whether the region of a scene that stands still is at one depth; ``None`` where that is not known."""
 
-    def add(self, said: Testimony, sign: int, near_us: tuple[float, float]) -> None:
-        """Take what a pass of direction *sign* says, and from when to when it was near focus."""
+    def add(self, said: Testimony, sign: int, near_us: tuple[float, float], flat_within_um: float = 0.0) -> None:
+        """Take what a pass of direction *sign* says, and from when to when it was near focus.
+
+        A region counts as flat if its parts are in focus at one place to a standard deviation of *flat_within_um*.
+        """
         self._said.append((said, sign))
         self._near_us.append(near_us)
         self.depths_um = tuple(sign * at for at in said.depths) or self.depths_um
@@ -186,6 +224,15 @@ class Passes:
         if said.scene_moves or self._moved_between():
             self.take_for_moving()
         self.deaf = self.deaf or said.deaf
+        self.begin_um = max(self.begin_um, said.begin_um)
+        self.flat = None if self.scene_moves or self.depths_um else self._told_flat(flat_within_um)
+
+    def _told_flat(self, within_um: float) -> bool | None:
+        there, back = (
+            [said.parts for said, sign in self._said if said.parts is not None and sign == way]
+            for way in (self.sign, -self.sign)
+        )
+        return is_flat(there, back, within_um)
 
     def _moved_between(self) -> bool:
         """Say whether the newest pass met the scene elsewhere than an earlier one did."""
@@ -208,21 +255,12 @@ class Passes:
         """Say whether any of the times was near focus."""
         return any(begin <= when <= end for begin, end in self._near_us for when in times_us)
 
-    def lag_um(self) -> tuple[float, float]:
-        """Return how well the first pass knows its lag, and focus but for what makes events late: standard errors, um.
-
-        The worst of its witnesses in both: where a lens meets two planes or noise drowns the scene, it is the pairs
-        that are scattered, while the image's top looks as sharp as ever. Without any: nothing, infinity.
-        """
-        said = self._said[0][0].witnesses if self._said else ()
-        late = [one for one in said if one.shared > 0.0]
-        return max((one.shared for one in late), default=0.0), max((one.sigma for one in late), default=inf)
-
     def _of_one_lag(self) -> list[tuple[Witness, int]]:
         """Return all witnesses, each with the direction of its pass.
 
         Where there is more than one pass, those of one kind have the same lag taken off, their mean: what is common to
-        passes there and back cancels, and what each measured of the lag by itself would not.
+        passes there and back cancels, and what each measured of the lag by itself would not. Of a flat region, pairs
+        that turn elsewhere are late, or noise.
         """
         said = [(one, sign) for testimony, sign in self._said for one in testimony.witnesses]
         if len(self._said) < 2:
@@ -231,7 +269,8 @@ class Passes:
         for one, sign in said:
             alike = [other for other, _ in said if other.name == one.name]
             freed, shared = (float(np.mean([getattr(other, key) for other in alike])) for key in ("freed", "shared"))
-            evened.append((one.with_lag(freed, shared), sign))
+            even = one.with_lag(freed, shared)
+            evened.append((replace(even, astray=even.apart) if self.flat else even, sign))
         return evened
 
     def estimate(self, play: Play) -> FocusEstimate | None:
@@ -250,14 +289,14 @@ class Passes:
         )
 
 
-def _track_of(points: Sequence[tuple[int, float, NDArray[np.float64]]]) -> PeakTrack:
+def _track_of(points: Sequence[tuple[int, float, Sharpness]]) -> PeakTrack:
     track = PeakTrack()
     for point in points:
-        track.add_bands(*point)
+        track.add_sharpness(*point)
     return track
 
 
-def _jackknife(points: Sequence[tuple[int, float, NDArray[np.float64]]]) -> float:
+def _jackknife(points: Sequence[tuple[int, float, Sharpness]]) -> float:
     """Return the frames' standard error by leaving each point out in turn; infinite where one point carries it all.
 
     What motion does to a few frames is not scatter about a parabola: three points always lie on one.

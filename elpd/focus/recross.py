@@ -7,18 +7,24 @@ made until the answer is good enough or there have been enough of them. They are
 strays with time: a slow pass sees more of its motion.
 
 In a still scene it is dim light that asks for another pass. Photoreceptors are late there by more than an answer may be
-off, and what one pass tells of that hangs on which pixels are how dark. One way back does, at the sweep's speed.
+off, and what one pass tells of that hangs on which pixels are how dark. One way back does, at the sweep's speed. But in
+dim light few pixels turn, and many of those by noise, so one pass cannot tell that from several depths; two can.
 """
 
 from __future__ import annotations
 
-from math import sqrt
+from dataclasses import dataclass, replace
+from math import hypot, sqrt
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from elpd.focus import judging, safety
 from elpd.focus.approach import APPROACH_MARGIN_UM
+from elpd.focus.passes import Play
 from elpd.records import StopMode
 from elpd.units import after_ms
+from elpd.vision.witness import SYSTEMATIC_PAIRS, WIDTHS_PER_DEPTH_OF_FOCUS
 
 if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings
@@ -34,6 +40,14 @@ pixels answer late."""
 RUN_UP_DOF = 3.5
 """How far from focus a pass is at full speed at the latest: that much of the curve beside its top is believed."""
 
+RUN_UP_PAIRS = 2.0
+"""The same in a still scene, in lengths by which pairs begin before focus: in dim light or low contrast a pixel sends
+one event in tens of micrometres, and one more than a pair's own two has to undo what it held back when the lens turned.
+After half as much, midpoints in dim light lie 1 to 3 um later than those of the sweep, and the image's top as well."""
+
+MOST_RUN_UP_DOF = 25.0
+"""How far from focus it begins at the most."""
+
 MOST_DOUBT_DOF = 1.0
 """An answer that is off by more than this beside the reach has no second opinion."""
 
@@ -47,32 +61,40 @@ LOOKS_FOR_MOTION = 1
 """Rounds that are spent on seeing whether a scene moves that was taken for still: hands tremble at 5 Hz and faster, and
 two passes and a round last long enough for one to be seen on its way."""
 
-SIGMAS = 3.0
-"""So many standard errors may a lag lie from what was taken off for it; a depth of focus has to hold them."""
-
 ROUNDS_LEFT = 2.0
 """How many more rounds there must be time for, so that one is begun: the way to focus takes less than one."""
 
 
 def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings) -> bool:
-    """Say whether one pass is not enough: the scene has been seen to move, the light is dim, or the answer is doubtful.
+    """Say whether one pass is not enough: the scene has been seen to move, or a still one's answer is not certain.
 
     Where motion was suspected at rest and the answer is doubtful, the scene is taken for one that moves after all.
     Where events were lost near focus, a lamp flickers or several depths were told, other passes would not help.
     """
-    if watch.after.gap_near_crossing or watch.lit:
+    after = watch.after
+    if after.gap_near_crossing or watch.lit:
         return False
-    doubtful = (first is None or first.sigma_um > judging.limit_um(settings)) and not watch.after.depths_um
+    doubtful = not after.depths_um and (first is None or first.sigma_um > judging.limit_um(settings))
     if not watch.scene_moves and doubtful and watch.motion_suspected:
-        watch.after.take_for_moving()
-    return watch.scene_moves or doubtful or _is_dim(watch, settings)
+        after.take_for_moving()
+    if watch.scene_moves or doubtful:
+        return True
+    return first is not None and not after.depths_um and (not _certain(first, settings) or _pays(first, settings))
 
 
-def _is_dim(watch: Watch, settings: CycleSettings) -> bool:
-    """Say whether the lag alone may put a still scene's answer out of focus, and nothing else is in the way of one."""
-    lag_um, but_for_it_um = watch.after.lag_um
-    clear = but_for_it_um <= sqrt(2.0) * judging.limit_um(settings) and not watch.after.depths_um  # of two passes
-    return clear and SIGMAS * lag_um > settings.depth_of_focus_um
+def _pays(first: FocusEstimate, settings: CycleSettings) -> bool:
+    """Say whether the mean of two passes would have less than half the variance of a still scene's first answer.
+
+    It knows all but half the play and what pairs have of their own.
+    """
+    width_um = WIDTHS_PER_DEPTH_OF_FOCUS * settings.depth_of_focus_um
+    own_um = SYSTEMATIC_PAIRS * width_um / sqrt(2.0)
+    return first.sigma_um**2 > 2.0 * (own_um**2 + (0.5 * Play.up_to(settings.backlash_um).sigma_um) ** 2)
+
+
+def _certain(estimate: FocusEstimate | None, settings: CycleSettings) -> bool:
+    certain_um = min(settings.depth_of_focus_um / CERTAIN_SIGMAS, judging.limit_um(settings))
+    return estimate is not None and estimate.sigma_um <= certain_um
 
 
 def pass_again(
@@ -86,15 +108,15 @@ def pass_again(
     """Go over focus again until it is known or there is no more time: back, and then there and back.
 
     Returns what all passes say and the furthest place, um, in the sweep's direction. In a still scene a doubtful answer
-    may come of several depths; more passes would only make their mixture look certain. So they are believed only if it
-    is the lag alone that is in doubt, or if one of them has seen the scene move, which a hand that turned round in the
-    first did not show; else the answer is refused as it is.
+    may come of several depths; more passes would only make their mixture look certain. So they are believed only if
+    they tell that the region is flat (``vision.relief``), or if one of them has seen the scene move, which a hand that
+    turned round in the first did not show; else the answer stays as it was.
 
     The way is bounded: a few times the reach, the ramps and the play; its time is the caller's phase ``recross``. The
     lens is left on the side that the sweep came from.
     """
-    estimate, dim = first, _is_dim(watch, settings)
-    certain_um = min(settings.depth_of_focus_um / CERTAIN_SIGMAS, judging.limit_um(settings))
+    answer = estimate = first
+    past_um = 0.0 if watch.scene_moves else watch.after.past_um
     furthest_um = stage.here_um()
     for looks, ways in enumerate([(-sign,), *MOST_ROUNDS * [(sign, -sign)]]):
         begun_ns = stage.now_ns()
@@ -103,28 +125,62 @@ def pass_again(
         if estimate is not None:
             doubt_um = min(doubt_um, estimate.sigma_um)
         for way in ways:
-            _pass(stage, watch, settings, about_um, doubt_um, way)
+            _pass(stage, watch, settings, _Way(way, about_um, doubt_um, past_um))
             furthest_um = sign * max(sign * furthest_um, sign * stage.here_um())
             estimate = watch.after.estimate()
         took_ns = stage.now_ns() - begun_ns
-        if watch.scene_moves or dim:
-            enough = estimate is not None and estimate.sigma_um <= certain_um
+        if watch.scene_moves or watch.after.flat:
+            answer, enough = estimate, _certain(estimate, settings)
+        elif watch.after.flat is None:
+            answer, enough = first, False
         else:
-            estimate, enough = first, looks == LOOKS_FOR_MOTION
+            answer, enough = _mixed(first, settings), looks == LOOKS_FOR_MOTION
         if enough or stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:
             break
-    return estimate, furthest_um
+    return answer, furthest_um
 
 
-def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, doubt_um: float, way: int) -> None:
-    """Lead the lens over *about_um* in one direction, until focus has been seen to be passed."""
+def _mixed(first: FocusEstimate | None, settings: CycleSettings) -> FocusEstimate | None:
+    """Return the first answer with the error that it has where the region is not at one depth.
+
+    That is half a depth of focus, beyond which it is not flat, at the least.
+    """
+    if first is None:
+        return None
+    return replace(first, sigma_um=hypot(first.sigma_um, judging.limit_um(settings)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """In which direction to pass about which place, how well that is known, and how far past the peak to go at least.
+
+    What pixels have not answered yet when a pass ends tilts its answer, so in a still scene, where that shows, each
+    goes as far past its peak as the sweep did.
+    """
+
+    sign: int
+    about_um: float
+    doubt_um: float
+    past_um: float
+
+
+def _run_up_um(watch: Watch, settings: CycleSettings) -> float:
+    least_um, most_um = (dof * settings.depth_of_focus_um for dof in (RUN_UP_DOF, MOST_RUN_UP_DOF))
+    if watch.scene_moves:
+        return least_um
+    return float(np.clip(RUN_UP_PAIRS * watch.after.pairs_begin_um, least_um, most_um))
+
+
+def _pass(stage: Stage, watch: Watch, settings: CycleSettings, going: _Way) -> None:
+    """Lead the lens over a place in one direction, until focus has been seen to be passed."""
+    way, about_um, doubt_um = going.sign, going.about_um, going.doubt_um
     limits, capabilities = stage.parts.lens.limits, stage.parts.lens.capabilities
     speed_um_s = min(settings.speed_um_s, stage.to_um(limits.max_speed_sps))
     ramp_um = speed_um_s**2 / (2.0 * stage.to_um(limits.acceleration_sps2))
     beside_um = ramp_um + settings.backlash_um + APPROACH_MARGIN_UM
-    reach_um, run_up_um = (dof * settings.depth_of_focus_um + doubt_um for dof in (REACH_DOF, RUN_UP_DOF))
-    begin_um = stage.within_limits_um(about_um - way * run_up_um)
-    end_um = stage.within_limits_um(about_um + way * (reach_um + beside_um))
+    reach_um = REACH_DOF * settings.depth_of_focus_um + doubt_um
+    begin_um = stage.within_limits_um(about_um - way * (_run_up_um(watch, settings) + doubt_um))
+    end_um = stage.within_limits_um(about_um + way * (reach_um + going.past_um + beside_um))
     if way * (stage.here_um() - begin_um) > stage.um_per_step:
         watch.after.catch_up()
         stage.listener = watch.follow
@@ -135,8 +191,10 @@ def _pass(stage: Stage, watch: Watch, settings: CycleSettings, about_um: float, 
     if capabilities.native_velocity and capabilities.abrupt_stop:
         stage.send(end_um, speed_um_s)
         until = after_ms(stage.now_ns(), stage.travel_limit_ms(end_um, speed_um_s))
-        while not watch.after.seen_again and stage.now_ns() < until:
+        while stage.now_ns() < until:
             stage.read()
+            if watch.after.seen_again and watch.after.past_um >= going.past_um:
+                break
             if way * (stage.here_um() - end_um) > -stage.um_per_step:
                 break
         stage.parts.lens.stop(StopMode.ABRUPT)

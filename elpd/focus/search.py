@@ -48,6 +48,8 @@ class Search:
         No motion outlives it.
     exposed
         Whether this cycle's picture was made by opening the aperture, which then can tell darkness from a stuck lens.
+    shown
+        Whether it is a frame that was taken just now: a scene with structure in a frame is in the light.
     sink, enter, observe
         Where notes go, and who hears of phases and windows.
     cancelled, interrupt
@@ -67,6 +69,7 @@ class Search:
         deadline_ns: HostNs,
         *,
         exposed: bool,
+        shown: bool,
         sink: RunSink,
         enter: EnterPhase,
         observe: Callable[[ElpSample, float], None],
@@ -82,6 +85,7 @@ class Search:
         self._settings = settings
         self._deadline_ns = deadline_ns
         self._exposed = exposed
+        self._shown = shown
         self._sink = sink
         self._phase = enter
         self._observe = observe
@@ -112,7 +116,7 @@ class Search:
         reach_um = self._settings.max_travel_um
         turned_at_um: float | None = None
         trodden_um = 0.0
-        lit, dark = watch.lit, True
+        lit, dark = watch.lit or self._shown, True
         while True:
             self._stage.listener = self._stage.interrupt = None  # a sweep asks for itself, and stops the lens first
             self.sign = sign

@@ -32,6 +32,7 @@ class CycleSettings:
     on_failure: Literal["hold", "start", "preset"] = "start"
     preset_um: float | None = None
     transmittance: Literal["profile", "linear", "iris"] = "profile"
+    background_activity_us: int = 0
 
     @classmethod
     def from_config(cls, config: Config) -> CycleSettings:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from elpd.errors import CameraError, LensError
 from elpd.events.edges import EdgeReader
+from elpd.focus.delays import Delays
 from elpd.focus.shake import Shake
 from elpd.ports import Latency, TakesMarks, TriggerInput
 from elpd.timebase import SensorClock
@@ -50,13 +51,18 @@ class Stage:
         self.report: LensReport | None = None
         self.packets = 0
         self.lost_events = 0
+        self.lost_at_rest = 0
+        """Of those, how many before the sensor at rest was known: they are missing in no sweep."""
         self.last_packet_ns = parts.clock.now_ns()
+        self._heard = True
         self.listener: Callable[[CameraPacket], object] | None = None
         """Hears every packet that is read while a phase waits."""
         wired = isinstance(parts.lens, TakesMarks) and parts.lens.mark_channel is not None
         self._edges = EdgeReader() if wired else None
         self.marks = 0 if wired else None
         """How many position marks were believed; ``None`` where none are wired."""
+        self.delays = Delays()
+        """How old packets were."""
         self.shake = Shake()
         """What the camera's gyroscope says of the rig, where it has one."""
         self.shedding: Shedding | None = None
@@ -105,12 +111,18 @@ class Stage:
         if report is not None:
             self.report = report
         if packet is None:
-            silent_ms = (self.now_ns() - self.last_packet_ns) / NS_PER_MS
-            if silent_ms > SILENCE_MS:
+            now = self.now_ns()
+            silent_ms = (now - self.last_packet_ns) / NS_PER_MS
+            if silent_ms > SILENCE_MS and self._heard:
+                # Whoever was so far behind was this side: it has only now caught up with what had gathered.
+                self.last_packet_ns = now
+            elif silent_ms > SILENCE_MS:
                 raise CameraError(
                     f"camera: no data for {silent_ms:.0f} ms (limit {SILENCE_MS:.0f}); check its cable and power"
                 )
+            self._heard = False
             return None
+        self._heard = True
         if self.shedding is not None:
             packet = self.shedding.take(packet)
         self.packets += 1
@@ -118,6 +130,7 @@ class Stage:
         self.lost_events += packet.lost_events
         if packet.complete_until_us is not None:
             self.sensor_clock.saw(packet.complete_until_us, packet.received_ns)
+            self.delays.received(self.sensor_clock.to_host(packet.complete_until_us), packet.received_ns)
         if packet.frames:
             self.frame = packet.frames[-1]
         if packet.imu:
@@ -215,7 +228,8 @@ class Stage:
             if self.sensor_clock.known and (spoken_us is None or self.sensor_clock.to_host(spoken_us) >= begun_ns):
                 return
         raise CameraError(
-            f"camera: silent for {(self.now_ns() - self.last_packet_ns) / NS_PER_MS:.0f} ms (limit {limit_ms:.0f}); "
+            f"camera: it has not said how things are now for {self.elapsed_ms(begun_ns):.0f} ms (limit {limit_ms:.0f}; "
+            f"its last packet came {(self.now_ns() - self.last_packet_ns) / NS_PER_MS:.0f} ms ago); "
             "check its cable and power"
         )
 

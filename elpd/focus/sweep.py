@@ -104,6 +104,7 @@ class Sweep:
             packet = stage.read(READ_TIMEOUT_S)
             if packet is not None:
                 heard_ns = stage.now_ns()
+                stage.delays.taken(packet.received_ns, heard_ns)
                 samples = watch.feed(packet)
                 if watch.passed:
                     stop = lens.stop(plan.stop_mode)
@@ -133,6 +134,7 @@ class Sweep:
             reported_um = abs(stage.to_um(report.steps) - begun_um)
             commanded_um = plan.speed_um_s * ((report.earliest_ns - begun_ns) / 1e9 - plan.turn_s)
         limits = stage.parts.lens.limits
+        lost = stage.lost_events - stage.lost_at_rest
         edge_um = stage.to_um(limits.max_steps if plan.sign > 0 else limits.min_steps)
         return safety.Conditions(
             cancelled=bool(self._cancelled()),
@@ -149,7 +151,7 @@ class Sweep:
             resting_events=self._watch.resting_rate_hz * (now - begun_ns) / 1e9,
             resting_counted=self._watch.resting_events,
             lit=plan.lit,
-            lost_fraction=stage.lost_events / max(1, stage.lost_events + self._watch.events_in_cycle),
+            lost_fraction=lost / max(1, lost + self._watch.events_in_cycle),
         )
 
     def _show(self, samples: list[ElpSample]) -> None:

@@ -85,6 +85,7 @@ class Watch:
             locate=locate,
             sensor=sensor,
             picture=picture,
+            support_us=settings.background_activity_us,
         )
         self.shedding = Shedding(roi)
         """What of a sweep is not looked at when there is too much of it."""

@@ -58,7 +58,10 @@ def load_run(path: Path) -> RecordedRun:
     try:
         head = json.loads((path / RUN_FILE).read_bytes())
     except (FileNotFoundError, NotADirectoryError):
-        raise FormatError(f"{path}: is no run folder: {_found_instead(path)}") from None
+        found = _found_instead(path)
+        raise FormatError(
+            f"{path}: is no run folder: {found}; runs lie in journal.directory, and `elpd runs` lists them"
+        ) from None
     except (OSError, ValueError) as error:
         raise FormatError(f"{path / RUN_FILE}: cannot be read ({error}); is it a run of elpd?") from None
     wanted = {"format", "elpd", "config", "request", "result", "error", "truth", "truncated", "attachments"}

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 
 from elpd.errors import FormatError
-from elpd.events.stream import PacketDecoder
 from elpd.record.journal import DECISIONS_FILE
 from elpd.record.playback import TapeReader
 from elpd.record.replay import RecordedRun, load_run
@@ -187,10 +186,8 @@ def _aimed_at(path: Path, notes: list[Note]) -> tuple[NDArray[np.uint8] | None, 
             opening_us = 1000.0 * (tape.facts.opening_ms or 0.0)
             open_us = int(exposed["open_us"])
             gathered = FirstEventMap(tape.facts.geometry, None, round(open_us + 2 * opening_us) if opening_us else None)
-            decoder = PacketDecoder(tape.facts.geometry)
             for packet in tape.packets():
-                events = decoder.feed(packet)
-                gathered.add(events.t, events.x, events.y, events.p)
+                gathered.add_packet(packet)
                 if gathered.complete:
                     break
         image = temporal_image(gathered.believed(), iris, None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import structlog
@@ -20,7 +20,7 @@ from elpd.record.journal import RunWriter
 from elpd.records import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from elpd.config import Config
@@ -39,6 +39,8 @@ class Session:
     map: TemporalImage | None
     sharpest: Sharpest | None = None
     """The picture in focus, as a ruler for its loss, where the sweep has seen it."""
+    delays: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """How old packets were, us, by stage."""
 
     @property
     def focused(self) -> bool:
@@ -96,4 +98,4 @@ def focus_on(
         result = replace(result, warnings=(*result.warnings, *parts.lens.remarks))
     structlog.get_logger().info("focus cycle", **result_fields(result), truth=truth, run=run.path)
     ruler = cycle.sharpest(config.modes.defocus_dof) if result.outcome is Outcome.FOCUSED else None
-    return Session(result, truth, run.path, cycle.map, ruler)
+    return Session(result, truth, run.path, cycle.map, ruler, cycle.delays)

@@ -112,6 +112,8 @@ class SweepSearch:
         self._depth_of_focus_um = depth_of_focus_um if ruler.in_um else None
         self._begin_us = int(sweep.t_us[0]) if begin_us is None else begin_us
         self._reference = reference
+        self._sharpest = reference
+        """Which picture tells bright pixels from dark ones: blur hides how dark the dark ones are."""
         self._start: NDArray[np.float32] | None = None
         windows: Windows = WindowsByEvents.for_roi(roi)
         if self._depth_of_focus_um is not None:
@@ -187,12 +189,14 @@ class SweepSearch:
             self._blank = 0
             self._reference = reference
             self._meter.set_reference(reference)
+            if self._sharpest is None or reference.scale_px <= self._sharpest.scale_px:
+                self._sharpest = reference
         if not len(self._frames) and t_us <= self._begin_us + _START_US:
             self._start = reference.brightness
         if t_us < self._begin_us:
             return None
         exposed = self._ruler.position(t_us - self._sweep.frame_age_us)
-        self._frames.add_bands(t_us, exposed, self._frame_energy.measure(pixels))
+        self._frames.add_sharpness(t_us, exposed, self._frame_energy.measure(pixels))
         found = self._attempt(t_us)
         return None if found is None else replace(found, decided_us=t_us)
 
@@ -228,7 +232,7 @@ class SweepSearch:
         # An attempt costs many windows' worth of work, so the longer it goes on in vain, the rarer it gets.
         self._attempts += 1
         self._attempts_until = self._detector.samples + max(_RETRY_EVERY, self._attempts)
-        brightness = None if self._reference is None else self._reference.brightness
+        brightness = None if self._sharpest is None else self._sharpest.brightness
         said, self._width = self._memory.witnesses(now_us, self._ruler, brightness, self._start)
         if self._memory.depths:
             witnesses = []  # of several planes frames show a mixture

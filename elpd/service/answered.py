@@ -195,7 +195,7 @@ class RecordAnswer(Result):
 
 
 class RunSummary(Result):
-    """One run of many. *at* is ISO 8601, UTC; *outcome* is ``None`` where an error ended it."""
+    """One run of many. *at* is ISO 8601, UTC; *outcome* is ``None`` where an error ended it; *final_um* is at rest."""
 
     name: str
     at: str | None
@@ -203,6 +203,7 @@ class RunSummary(Result):
     reason: str | None
     focus_um: float | None
     sigma_um: float | None
+    final_um: float | None = None
     duration_ms: float | None
     kept: bool
 

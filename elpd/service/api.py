@@ -19,11 +19,11 @@ import structlog
 
 from elpd.errors import UnavailableError
 from elpd.service.connection import Connection
-from elpd.service.desk import Desk, answer_line, error_line
-from elpd.service.engine_port import Answer, Caller, ClientCounts, error_body
+from elpd.service.desk import Desk, error_line
+from elpd.service.engine_port import Caller, ClientCounts, error_body
 from elpd.service.listening import Listening, default_path, listen_at
-from elpd.service.messages import PhaseEvent, PositionEvent, ResultEvent, SampleEvent
 from elpd.service.peers import Operators, peer_of
+from elpd.service.telling import Telling
 
 if TYPE_CHECKING:
     import socket
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
     from elpd.config import ApiSection
     from elpd.service.engine_port import Engine
-    from elpd.service.lines import Call, Number
-    from elpd.service.messages import Event
+    from elpd.service.lines import Call
 
 MOST_CLIENTS = 32
 
@@ -41,8 +40,6 @@ MOST_STOPPERS = 8
 """Further connections, for `stop` and `cancel` alone: a full house must not keep a STOP out. The oldest makes room."""
 
 LINES_A_TURN = 8
-EVENTS_A_TURN = 32
-MOST_EVENTS_WAITING = 4096
 
 BEAT_S = 0.25
 """The loop's housekeeping and its sign of life."""
@@ -73,18 +70,17 @@ class ApiServer:
         self._section = section
         self._listening = Listening(list(sockets))
         self._operators = Operators.of_group(section.operators)
-        self._desk = Desk(engine, self._answered)
+        self._connections: dict[int, Connection] = {}
+        self._news = asyncio.Event()
+        self._telling = Telling(self._connections.values, self._soon, self._from_any_thread, self._news.set)
+        self._desk = Desk(engine, self._telling.answer)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ending = asyncio.Event()
-        self._news = asyncio.Event()
         self._running = threading.Event()
         self._thread = threading.Thread(target=self._run, name="elpd-api", daemon=True)
-        self._connections: dict[int, Connection] = {}
         self._numbers = 0
         self.stops = 0
         self._working: deque[Connection] = deque()
-        self._to_tell: deque[Event | tuple[Connection, Number, Answer]] = deque()
-        self._woken = False
         self._dropped_clients = 0
         self._dropped_events = 0
         self._log = structlog.get_logger()
@@ -134,7 +130,7 @@ class ApiServer:
 
     async def _serve(self, loop: asyncio.AbstractEventLoop) -> None:
         loop.set_exception_handler(self._broke)
-        quit_listening = self._engine.listen(self._hear)
+        quit_listening = self._engine.listen(self._telling.event)
         options: dict[str, Any] = {"cleanup_socket": False} if sys.version_info >= (3, 13) else {}
         servers = [
             await loop.create_unix_server(lambda: Connection(self), sock=listener, **options)
@@ -174,6 +170,11 @@ class ApiServer:
     def _soon(self, work: Callable[[], None]) -> None:
         assert self._loop is not None
         self._loop.call_soon(work)
+
+    def _from_any_thread(self, work: Callable[[], None]) -> None:
+        if self._loop is not None:
+            with suppress(RuntimeError):  # it has ended: there is nobody left to tell
+                self._loop.call_soon_threadsafe(work)
 
     def _broke(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         del loop
@@ -225,7 +226,8 @@ class ApiServer:
         self._count()
 
     def _count(self) -> None:
-        self._engine.note_clients(ClientCounts(len(self._connections), self._dropped_clients, self._dropped_events))
+        dropped = self._dropped_events + self._telling.dropped
+        self._engine.note_clients(ClientCounts(len(self._connections), self._dropped_clients, dropped))
 
     def _work(self) -> None:
         """Take a few lines, one of each client in turn."""
@@ -238,65 +240,3 @@ class ApiServer:
                 self._working.append(connection)
         if self._working:
             self._soon(self._work)
-
-    # --- what the engine tells, from its threads --------------------------------------------------------------------
-
-    def _hear(self, event: Event) -> None:
-        if len(self._to_tell) >= MOST_EVENTS_WAITING and isinstance(event, SampleEvent | PositionEvent):
-            self._dropped_events += 1
-            return
-        self._wake(event)
-
-    def _answered(self, connection: Connection, number: Number, answer: Answer) -> None:
-        self._wake((connection, number, answer))
-
-    def _wake(self, item: Event | tuple[Connection, Number, Answer]) -> None:
-        self._to_tell.append(item)
-        if not self._woken and self._loop is not None:
-            self._woken = True
-            with suppress(RuntimeError):  # the loop has ended: there is nobody left to tell
-                self._loop.call_soon_threadsafe(self._tell)
-
-    def _tell(self) -> None:
-        """Pass on a few events and answers, in the order in which they came."""
-        self._woken = False
-        for _ in range(min(EVENTS_A_TURN, len(self._to_tell))):
-            item = self._to_tell.popleft()
-            if isinstance(item, tuple):
-                connection, number, answer = item
-                connection.in_flight.remove(number)
-                self._news.set()
-                connection.send(answer_line(number, answer))
-            else:
-                self._spread(item)
-        if self._to_tell and not self._woken:
-            self._woken = True
-            self._soon(self._tell)
-
-    def _spread(self, event: Event) -> None:
-        body = ""
-        for connection in self._connections.values():
-            if event.event not in connection.wanted:
-                continue
-            for late in _samples_before(connection, event):
-                _send_event(connection, late.model_dump_json(), droppable=True)
-            if isinstance(event, SampleEvent):
-                continue
-            body = body or event.model_dump_json()
-            _send_event(connection, body, droppable=isinstance(event, PositionEvent))
-
-
-def _samples_before(connection: Connection, event: Event) -> list[SampleEvent]:
-    """Return what the client is told of samples now: some of those there are, and the last one before a phase ends."""
-    if connection.decimator is None:
-        return []
-    if isinstance(event, SampleEvent):
-        return connection.decimator.take(event)
-    return connection.decimator.held() if isinstance(event, PhaseEvent | ResultEvent) else []
-
-
-def _send_event(connection: Connection, body: str, *, droppable: bool) -> None:
-    """Send an event, numbered for this client: a number that is missing was dropped."""
-    connection.told += 1
-    line = f'{{"seq":{connection.told},{body[1:]}\n'.encode()
-    connection.send(line, droppable=droppable, seq=connection.told)

@@ -104,6 +104,7 @@ def _summary(folder: Path, head: dict[str, Any]) -> RunSummary:
         reason=result.get("reason") or error.get("message"),
         focus_um=result.get("focus_um"),
         sigma_um=result.get("sigma_um"),
+        final_um=result.get("final_um"),
         duration_ms=result.get("duration_ms"),
         kept=stamp is None,
     )

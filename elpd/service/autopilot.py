@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from elpd.focus.settings import CycleSettings
 from elpd.records import Roi
 from elpd.service import modes, temperature
+from elpd.service.elsewhere import Elsewhere
 from elpd.service.engine_port import Caller, Request
 from elpd.service.evidence import Evidence
 from elpd.service.job import Job
@@ -60,6 +61,7 @@ class Autopilot:
         self._defocused = self._focused_once = False
         self._since_s = time.now_s()
         self._strikes = self._failures = 0
+        self._elsewhere = Elsewhere()
         self._celsius: float | None = None
         self._read_s = float("-inf")
         self.reconfigure(config)
@@ -90,6 +92,7 @@ class Autopilot:
             if mode is not None:
                 self._mode, self._resting = mode, None
                 self._since_s, self._strikes, self._failures = self._time.now_s(), 0, 0
+                self._elsewhere.forget()
             self._kept.change(mode=self._mode, period_s=self._period_s)
         self._situation.set_mode(self._mode)
 
@@ -125,6 +128,7 @@ class Autopilot:
         with self._lock:
             self._resting = f"focus to be asked for: {why}"
             self._at_focus_um, self._focused_once = None, False
+            self._elsewhere.forget()
             self._forget()
 
     # --- what the focus thread says ----------------------------------------------------------------------------------
@@ -137,6 +141,11 @@ class Autopilot:
             return config.service.look_every_s
         simulated = config.rig == "sim" and config.camera.driver == "sim"
         return SIMULATED_LOOK_EVERY_S if simulated and self._mode != "continuous" else 0.0
+
+    @property
+    def weighs(self) -> bool:
+        """Whether what the camera says is weighed: there is a focus that can be lost."""
+        return self._mode == "continuous" and self._evidence is not None
 
     def opened(self) -> None:
         """Begin with a rig of which nothing is known."""
@@ -170,7 +179,11 @@ class Autopilot:
         with self._lock:
             decision = self._decide()
             self._defocused = decision.defocused
-            job = self._job("focus", FocusParams()) if decision.focus else self._compensation()
+            if self._elsewhere.goes_on:
+                wish = None if self._blocked() is not None else self._elsewhere.wish()
+                job = None if wish is None else self._job(*wish)
+            else:
+                job = self._job("focus", FocusParams()) if decision.focus else self._compensation()
         return job if job is not None and self._place.begin(job) else None
 
     def ended(self, job: Job, answer: Answer, session: Session | None) -> None:
@@ -183,6 +196,8 @@ class Autopilot:
                     self._cycle_ended(result, session)
             elif method in MOVES_BY_HAND and not job.automatic:
                 self.rest(f"somebody has moved the lens ({method})")
+            elif method == "move" and job.automatic and self._elsewhere.goes_on:
+                self._elsewhere.moved(ended_well=result is not None)
             elif method == "move" and job.automatic and result is not None:
                 self._at_focus_um = self._situation.lens.position_um
 
@@ -196,7 +211,10 @@ class Autopilot:
             self._at_focus_um = before_um if back else None
             if result.outcome != "CANCELLED":
                 self._failures, self._strikes = self._failures + 1, self._strikes + 1
+            if self._mode == "continuous":
+                self._elsewhere.failed(result.outcome, self._situation.lens, self._depth_um)
             return
+        self._elsewhere.forget()
         self._resting, self._focused_once, self._failures = None, True, 0
         self._at_focus_um, self._sign = result.final_um, int(result.details.get("sweep_sign") or 0)
         moved = before_um is None or result.final_um is None or abs(result.final_um - before_um) > self._depth_um
@@ -260,6 +278,7 @@ class Autopilot:
             since_s=self._since_s,
             strikes=self._strikes,
             failures=self._failures,
+            searched=bool(self._elsewhere.places_um),
         )
 
     def _decide(self) -> modes.Decision:

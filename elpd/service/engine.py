@@ -76,8 +76,8 @@ class RigEngine:
         The engine's time, and where requests wait; ``threads.run`` and tests make them.
     threaded
         Whether what needs no device is done by a thread of its own.
-    build
-        Opens the rig.
+    build, prepare
+        Opens the rig; has the kernels for another one, where the configuration is changed.
     """
 
     def __init__(
@@ -88,19 +88,21 @@ class RigEngine:
         *,
         threaded: bool = False,
         build: Callable[[Config], RigParts] = rig.build,
+        prepare: Callable[[Config], None] = lambda _: None,
     ) -> None:
         self.config = config
         self.time = time
         self.place = place or Place()
         self.heartbeats = Heartbeats()
-        self.keeper = RigKeeper(config, build)
+        self.keeper = RigKeeper(config, build, prepare)
         self.situation = Situation(config, time.now_s)
         self.lease = Lease(time.now_s)
         self._threaded = threaded
         self.backroom = Backroom(threaded=threaded)
         self.album = Album(time.now_s)
         self._kept = Kept(state_directory(config))
-        self._stopping = False
+        self.stopping = False
+        """Whether this is the end."""
         attention = Attention(self.heartbeats, FOCUS_LOOP)
         work = Work(self.situation, attention, self._kept)
         self.autopilot = Autopilot(config, self.situation, self._kept, self.lease, self.place, time)
@@ -227,7 +229,7 @@ class RigEngine:
     def begin_stopping(self) -> None:
         """Stop the lens, refuse what comes, end what runs. From any thread; the bytes leave first."""
         failure = self.keeper.stop_lens(StopMode.RAMPED)
-        self._stopping = True
+        self.stopping = True
         self.situation.stopping()
         self.place.cancel_all(Cancel.HOLD, "the daemon is going down; the lens was left where it stopped")
         self.place.ring()
@@ -250,7 +252,7 @@ class RigEngine:
         if method in {"stop", "cancel", "clear"}:
             job.finish(answer_of(getattr(self, method)))
             return
-        if self._stopping:
+        if self.stopping:
             raise UnavailableError("the daemon is going down; nothing was done")
         if operates(method, params):
             self.lease.refuse_others(request.caller)

@@ -37,6 +37,9 @@ SIGMAS = 6.0
 BIN_S = 0.1
 """Events are summed over so long before they are judged."""
 
+LEAST_BIN = 0.9
+"""Events come a bin's length at a time, give or take a little; a little short is better than twice as long."""
+
 SPANS = (1, 2, 4, 8, 16, 32, 64)
 """Over how many bins a change may take place."""
 
@@ -96,20 +99,21 @@ class Evidence:
         if self._bin_begun_s is None:
             self._bin_begun_s = now_s
         roi = self._roi
-        x, y = events.x.astype(np.int64) - roi.x, events.y.astype(np.int64) - roi.y
-        inside = (x >= 0) & (x < roi.width) & (y >= 0) & (y < roi.height)
-        self._waiting.append(((y * roi.width + x)[inside], 2.0 * events.p[inside] - 1.0))
-        self._waiting_events += int(inside.sum())
-        if now_s - self._bin_begun_s >= BIN_S or self._waiting_events > MOST_WAITING:
+        # Unsigned, what lies before the region wraps to far beyond it.
+        x, y = events.x - np.uint16(roi.x), events.y - np.uint16(roi.y)
+        inside = (x < roi.width) & (y < roi.height)
+        self._waiting.append((y[inside].astype(np.int64) * roi.width + x[inside], 2.0 * events.p[inside] - 1.0))
+        self._waiting_events += self._waiting[-1][0].size
+        if now_s - self._bin_begun_s >= LEAST_BIN * BIN_S or self._waiting_events > MOST_WAITING:
             self._close_bin()
 
     def _close_bin(self) -> None:
         pixel = np.concatenate([one for one, _ in self._waiting])
         sign = np.concatenate([one for _, one in self._waiting])
-        self._waiting, self._waiting_events, self._bin_begun_s = [], 0, None
+        self._waiting, self._waiting_events, self._bin_begun_s = [], 0, self._now_s
         count = np.bincount(pixel, minlength=self._weights.size).reshape(self._weights.shape)
         self._hot |= hot_pixels(count)
-        weight = np.where(self._hot, 0.0, self._weights).ravel()[pixel]
+        weight = np.where(self._hot.ravel()[pixel], 0.0, self._weights.ravel()[pixel])
         lost, variance = float(weight @ sign), float(weight @ weight)
         if lost**2 > STIR_SIGMAS**2 * variance:
             self._stirred_s = self._now_s

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from elpd.errors import CameraError, LensError
-from elpd.events.decoder import EventArrays
-from elpd.events.stream import PacketDecoder
 from elpd.records import Geometry, LensFlag
+from elpd.service.gathering import Gathering
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from elpd.config import ServiceSection
+    from elpd.events.decoder import EventArrays
     from elpd.ports import RigParts
     from elpd.records import Frame, LensReport
     from elpd.service.situation import Situation
@@ -29,6 +27,12 @@ if TYPE_CHECKING:
 LISTEN_TURN_S = 0.02
 """One turn of listening: packets gather meanwhile, since waking for each costs more than what it holds. No camera's
 buffers fill in that time, and a request ends the wait."""
+
+TOLD_EVERY_S = 0.1
+"""So often what has gathered is decoded and passed on."""
+
+MOST_GATHERED_BYTES = 1 << 18
+"""Or sooner, where a scene is busy: this is some milliseconds of work, which a request may have to wait for."""
 
 MOST_PACKETS_A_TURN = 256
 """More than a camera sends in a turn; one that floods must not keep a request waiting."""
@@ -72,7 +76,10 @@ class Idle:
         self._settings = settings
         self._hear = hear
         self._geometry = Geometry(1, 1)
-        self._decoder: PacketDecoder | None = None
+        self._gathering = Gathering(self._geometry)
+        self._frame: Frame | None = None
+        self._lost = self._backlog = 0
+        self._told_s = float("-inf")
         self._look_begun_s: float | None = None
         self._look_ended_s = float("-inf")
         self._last_packet_s = 0.0
@@ -98,7 +105,7 @@ class Idle:
     def opened(self, parts: RigParts) -> None:
         """Begin with a rig that was just opened."""
         geometry = parts.camera.geometry
-        self._geometry, self._decoder = geometry, PacketDecoder(geometry)
+        self._geometry, self._gathering = geometry, Gathering(geometry)
         self._attended_s = float("-inf")
         self._look_begun_s, self._look_ended_s, self._polled_s = None, float("-inf"), float("-inf")
         limits = parts.lens.limits
@@ -138,6 +145,7 @@ class Idle:
     def leave(self, parts: RigParts) -> None:
         """Stop listening: a cycle needs the camera for itself."""
         if self._look_begun_s is not None:
+            self._tell(self._time.now_s())
             self._look_begun_s = None
             parts.camera.stop()
         self._look_ended_s = self._time.now_s()
@@ -157,7 +165,7 @@ class Idle:
 
     def _begin_look(self, parts: RigParts, now_s: float) -> None:
         parts.camera.start()
-        self._decoder = PacketDecoder(self._geometry)
+        self._gathering = Gathering(self._geometry)
         self._last_packet_s = now_s
         self._attend(now_s)
 
@@ -166,13 +174,14 @@ class Idle:
         self._look_begun_s, self._events = now_s, 0
         attentive = self.somebody_watches or now_s - self._attended_s >= GLANCE_EVERY_S
         if attentive and not self._attentive:
-            self._decoder = PacketDecoder(self._geometry)  # what it knew of time and place is old
+            self._gathering = Gathering(self._geometry)  # what it knew of time and place is old
         self._attentive = attentive
         if attentive:
             self._attended_s = now_s
 
     def _end_look(self, parts: RigParts) -> None:
         now_s, begun_s = self._time.now_s(), self._look_begun_s
+        self._tell(now_s)
         assert begun_s is not None, "a look ends after it began"
         if self._attentive:
             self._listened_s += now_s - begun_s
@@ -187,39 +196,37 @@ class Idle:
     def _listen(self, parts: RigParts) -> None:
         """Take what has come in a turn."""
         self._time.nap(LISTEN_TURN_S)
-        pieces: list[EventArrays] = []
-        events, lost, backlog, frame = 0, 0, 0, None
+        came = False
         for _ in range(MOST_PACKETS_A_TURN):
             packet = parts.camera.read(0.0)
             if packet is None:
                 break
-            self._last_packet_s = self._time.now_s()
-            if not self._attentive:
-                lost += packet.lost_events
-                continue
-            assert self._decoder is not None, "a look begins with a decoder"
-            heard = self._decoder.feed(packet)
-            events, lost = events + int(heard.t.size), lost + packet.lost_events
-            backlog, frame = packet.backlog, packet.frames[-1] if packet.frames else frame
-            pieces.append(EventArrays(heard.t.copy(), heard.x.copy(), heard.y.copy(), heard.p.copy()))
-        if pieces:
-            self._hear(frame, joined(pieces))
-        silent_s = self._time.now_s() - self._last_packet_s
+            came, self._lost, self._backlog = True, self._lost + packet.lost_events, packet.backlog
+            if self._attentive:
+                self._gathering.add(packet)
+                self._frame = packet.frames[-1] if packet.frames else self._frame
+        now_s = self._time.now_s()
+        if came:
+            self._last_packet_s = now_s
+        if now_s - self._told_s >= TOLD_EVERY_S or self._gathering.size_bytes > MOST_GATHERED_BYTES:
+            self._tell(now_s)
+        silent_s = now_s - self._last_packet_s
         if silent_s > SILENCE_S:
             raise CameraError(
                 f"camera: no data for {silent_s:.1f} s (limit {SILENCE_S:g}) while nothing moved; check its cable "
                 "and power, then clear the fault"
             )
-        self._events += events
+
+    def _tell(self, now_s: float) -> None:
+        """Decode what has gathered, and pass it on."""
+        self._told_s = now_s
+        heard, events = self._gathering.take(), 0
+        frame, self._frame = self._frame, None
+        lost, self._lost = self._lost, 0
+        if heard is not None:
+            events = int(heard.t.size)
+            self._events += events
+            self._hear(frame, heard)
         if self._attentive or lost:
-            self._situation.heard(events, lost, backlog=backlog, **({"has_frames": True} if frame else {}))
-
-
-def joined(pieces: Sequence[EventArrays]) -> EventArrays:
-    """Return the events of several packets as one."""
-    return EventArrays(
-        np.concatenate([one.t for one in pieces]),
-        np.concatenate([one.x for one in pieces]),
-        np.concatenate([one.y for one in pieces]),
-        np.concatenate([one.p for one in pieces]),
-    )
+            known = {"has_frames": True} if frame is not None else {}
+            self._situation.heard(events, lost, backlog=self._backlog, **known)

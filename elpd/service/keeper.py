@@ -34,10 +34,19 @@ class RigKeeper:
         Which rig.
     build
         Opens it; ``elpd.rig.build`` unless a test has another.
+    prepare
+        Has what a configuration needs before its rig is opened, such as kernels; called again, it has nothing to do.
     """
 
-    def __init__(self, config: Config, build: Callable[[Config], RigParts] = rig.build) -> None:
+    def __init__(
+        self,
+        config: Config,
+        build: Callable[[Config], RigParts] = rig.build,
+        prepare: Callable[[Config], None] = lambda _: None,
+    ) -> None:
         self.config = config
+        self._prepare = prepare
+        self._prepared = config
         self.parts: RigParts | None = None
         self.needs_home = False
         """Whether the lens may have moved unseen since it last was referenced."""
@@ -51,6 +60,16 @@ class RigKeeper:
     def in_real_time(self) -> bool:
         """Whether the lens lives in the machine's own time, and moves on while nobody here does anything."""
         return self.parts is not None and isinstance(self.parts.clock, MonotonicClock)
+
+    @property
+    def unprepared(self) -> bool:
+        """Whether another configuration was taken that needs preparing."""
+        return self.config is not self._prepared
+
+    def prepare(self) -> None:
+        """Have what the configuration needs; may take many seconds."""
+        self._prepare(self.config)
+        self._prepared = self.config
 
     def open(self, now_s: float) -> RigParts:
         """Open the rig.

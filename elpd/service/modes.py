@@ -4,7 +4,7 @@ Hunting is the disease of continuous autofocus, so a cycle needs four things at 
 (beyond one level to count as lost, below a half of it to count as found again), a scene that has become quiet, the end
 of a hold-off since the last cycle, and a lens that nobody else has put where it is. The hold-off doubles with every
 cycle that did not find focus or found it where it was; after ``MOST_FAILURES`` without focus the lens rests until
-somebody asks.
+somebody asks. Before that it has been looked once whether focus is elsewhere (``elsewhere``).
 
 A scene in which nothing changes sends no events, and what crept away unheard leaves no evidence; for that, and only if
 it is set, focus is checked again when it was not for so long.
@@ -35,7 +35,7 @@ class View:
     ``loss`` is how much sharpness was certainly lost, 1 being what counts as out of focus. ``defocused`` is the
     decision of before. ``since_s`` is the end of the last cycle, or when
     the mode was chosen. ``strikes`` counts cycles in a row that were of no use, ``failures`` those that did not even
-    find focus.
+    find focus; ``searched``, whether cycles were begun all over the lens's travel since it was found last.
     """
 
     mode: ModeName
@@ -48,6 +48,7 @@ class View:
     since_s: float = 0.0
     strikes: int = 0
     failures: int = 0
+    searched: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,8 @@ def decide(view: View, patience: Patience) -> Decision:
         left_s = view.since_s + patience.period_s - view.now_s
         return wait("its time", left_s) if left_s > 0 else Decision(True, defocused, "nothing")
     if view.failures >= MOST_FAILURES:
-        return wait(f"somebody to ask, after {view.failures} cycles without focus")
+        where = ", begun at places all over the lens's travel" if view.searched else ""
+        return wait(f"somebody to ask, after {view.failures} cycles without focus{where}")
     left_s = view.since_s + hold_off_s(view, patience) - view.now_s
     if left_s > 0 and (view.focused_once or view.failures):
         return wait("the end of the hold-off", left_s)

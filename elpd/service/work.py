@@ -132,9 +132,12 @@ class Work:
         stages = self._situation.stages
         stages.add("cycle", 1e6 * wall_s)
         if session.result.stop_latency_us is not None:
-            stages.add("stop", float(session.result.stop_latency_us))
+            stages.add("stop command", float(session.result.stop_latency_us))
         for phase in session.result.phases:
             stages.add(phase.name, 1e3 * phase.ms)
+        for stage, durations_us in session.delays.items():
+            for duration_us in durations_us:
+                stages.add(stage, duration_us)
 
     def _keep_map(self, session: Session, config: Config) -> None:
         """Let a person look, draw, and then focus with ``reference: last``."""

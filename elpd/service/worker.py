@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 NAP_WITHOUT_RIG_S = 0.05
 
+PREPARED_WITHIN_S = 180.0
+"""Compiling takes ten seconds of two cores of a PC; this is for a board that is four times as slow, and has one."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -102,7 +105,7 @@ class Worker:
             self._run(job, parts)
             return
         self._idle.every_s = self._autopilot.listen_every_s
-        self._idle.somebody_watches = self._autopilot.mode == "continuous" or self._watched()
+        self._idle.somebody_watches = self._autopilot.weighs or self._watched()
         try:
             self._idle.turn(parts, needs_home=self._keeper.needs_home)
         except DeviceError as error:
@@ -143,10 +146,12 @@ class Worker:
             fault = self._situation.fault
             why = "no rig" if fault is None else fault.message
             self._finish(waiting, Answer(error=ErrorBody(kind="Fault", message=f"nothing was moved: {why}")))
-        now_s = self._time.now_s()
-        if not self._keeper.due(now_s):
+        if not self._keeper.due(self._time.now_s()):
             self._time.nap(NAP_WITHOUT_RIG_S)
             return
+        if self._keeper.unprepared and not self._prepared():
+            return
+        now_s = self._time.now_s()
         try:
             with self._attention.without_signs(30.0):
                 parts = self._keeper.open(now_s)
@@ -170,6 +175,20 @@ class Worker:
                 "lens-unreferenced", "the lens may have moved unseen and this controller cannot home; see where it is"
             )
         log.info("rig open", needs_home=self._keeper.needs_home)
+
+    def _prepared(self) -> bool:
+        """Have the kernels of another rig's camera, for which all wait; ``False`` if the daemon was asked to end."""
+        self._situation.warn(
+            "compiling", "kernels for the other camera are being compiled; what is asked for is done after that"
+        )
+        try:
+            with self._attention.without_signs(PREPARED_WITHIN_S):
+                self._keeper.prepare()
+        except SystemExit:
+            return False
+        finally:
+            self._situation.unwarn("compiling")
+        return True
 
     def _let_go(self, *, lens_moved_unseen: bool) -> None:
         self._keeper.lose(self._time.now_s(), lens_moved_unseen=lens_moved_unseen)

@@ -11,22 +11,26 @@ transfer function is ``1 - 2π²f²·σ²``, with σ the RMS radius of the point
 radius is least: the definition of focus that needs no picture, and the one used here. Finer bands depart from it in
 proportion to f², but they have the steeper curves. So the bands' vertices are fitted as ``focus + departure·f²``, each
 with its own error; where the coarse bands know little, the departure is bounded by what lenses show (``DEPARTURE``).
+What edges of one direction depart from those of another is taken off before (``astigmatism``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin
+from elpd.vision.astigmatism import find_astigmatism
+from elpd.vision.integral import BANDS_PX, Vertex, band_gain, band_image, fit_vertex, inside_margin, with_window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    from elpd.vision.astigmatism import Astigmatism, Edges
 
 DEPARTURE = 0.04
 """Standard deviation, in widths of the curve, of how far the finest band's focus lies from the least RMS radius: the
@@ -39,7 +43,9 @@ UNEXPLAINED = 0.4
 """Share of the departure that may be wrong: transfer functions have terms beyond f²."""
 
 _FREQUENCIES = np.array([(BANDS_PX[0] / scale_px) ** 2 for scale_px in BANDS_PX])
-_CORNER = (np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0).astype(np.float32)
+CORNER = (np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0).astype(np.float32)
+"""The band next to the sampling limit, which measures white noise: a kernel of unit gain for it."""
+
 _GAINS = np.array([band_gain(scale_px) for scale_px in BANDS_PX])
 _FLOOR = 1e-3
 _SURPRISE = 3.0
@@ -76,7 +82,7 @@ def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
     bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
-    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, _CORNER), dtype=np.float32)[middle]]
+    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)[middle]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,34 +100,46 @@ class BandFocus:
     departure: float
     scatter: float
     as_blur: bool = True
+    astigmatism: Astigmatism | None = field(default=None, compare=False)
 
     def mirrored(self, sign: float) -> BandFocus:
         """Return the same on a ruler that runs the other way, where *sign* is -1."""
         finest = replace(self.finest, at=sign * self.finest.at)
-        return replace(self, at=sign * self.at, finest=finest, departure=sign * self.departure)
+        tilt = self.astigmatism.mirrored() if self.astigmatism is not None and sign < 0.0 else self.astigmatism
+        return replace(self, at=sign * self.at, finest=finest, departure=sign * self.departure, astigmatism=tilt)
 
 
 def focus_of_bands(
-    position: NDArray[np.float64], log_energies: NDArray[np.float64], half_width: float, bands: int = len(BANDS_PX)
+    position: NDArray[np.float64],
+    log_energies: NDArray[np.float64],
+    half_width: float,
+    bands: int = len(BANDS_PX),
+    edges: Sequence[Edges] | None = None,
+    *,
+    of_events: bool = False,
 ) -> BandFocus | None:
     """Fit each band's parabola, (points, bands), and the focus behind them; ``None`` if the finest has no peak.
 
-    No more than the *bands* finest ones are believed.
+    No more than the *bands* finest ones are believed. *edges* are those of the images at each point,
+    which *of_events* says that events built.
     """
     raw = [fit_vertex(position, log_energies[:, band], half_width) for band in range(len(BANDS_PX))]
-    finest = _with_window(raw[0], position, log_energies[:, 0], half_width)
+    finest = with_window(raw[0], position, log_energies[:, 0], half_width)
     if raw[0] is None or finest is None:
         return None
     scatter = float(np.hypot(raw[0].sigma, raw[0].sigma if raw[1] is None else raw[1].sigma))
     rise = log_energies[int(np.argmax(log_energies[:, 0]))] - log_energies[0]
     as_blur = bool(rise[1] < rise[0]) and (raw[1] is None or raw[1].width > raw[0].width)
+    tilt = None if edges is None else find_astigmatism(position, edges, half_width, finest.width, of_events=of_events)
+    shifts = [(0.0, 0.0)] * len(BANDS_PX) if tilt is None else [tilt.shift(one) for one in tilt.towards]
     bound = DEPARTURE * finest.width
     normal, right, squares, count = np.diag([0.0, 1.0 / bound**2]), np.zeros(2), 0.0, 0
     for band, f_squared in enumerate(_FREQUENCIES[:bands]):
-        vertex = _with_window(raw[band], position, log_energies[:, band], half_width)
+        vertex = with_window(raw[band], position, log_energies[:, band], half_width)
         row = np.array([1.0, f_squared])
         if vertex is None:
             break
+        place = vertex.at - shifts[band][0]
         # Structure that moves in and out of view tilts log S, and a tilt moves a vertex by the square of its width;
         # and there is the less structure to average over, the coarser the band.
         sigma = max(vertex.sigma, LEAST_SIGMA * finest.width) * (vertex.width / finest.width) ** 3
@@ -129,18 +147,20 @@ def focus_of_bands(
             # What the finer bands and the bound on the departure leave to expect here. A picture that has little
             # structure so coarse shows its drift instead, and does so in all bands coarser still.
             inverse = np.linalg.inv(normal)
-            surprise = vertex.at - float(row @ inverse @ right)
+            surprise = place - float(row @ inverse @ right)
             variance = float(row @ inverse @ row) + sigma**2
             if surprise**2 > _SURPRISE**2 * variance:
                 break
             squares += surprise**2 / variance
         normal += np.outer(row, row) / sigma**2
-        right += row * vertex.at / sigma**2
+        right += row * place / sigma**2
         count += 1
     inverse = np.linalg.inv(normal)
     focus, departure = (float(one) for one in inverse @ right)
     own = float(np.sqrt(inverse[0, 0] * max(1.0, squares / count)))
-    return BandFocus(focus, float(np.hypot(own, UNEXPLAINED * departure)), finest, departure, scatter, as_blur)
+    # The bands share the error of what was taken off.
+    sigma = float(np.linalg.norm([own, UNEXPLAINED * departure, shifts[0][1]]))
+    return BandFocus(focus, sigma, finest, departure, scatter, as_blur, tilt)
 
 
 def average_focus(candidates: Sequence[BandFocus]) -> BandFocus:
@@ -153,14 +173,3 @@ def average_focus(candidates: Sequence[BandFocus]) -> BandFocus:
     best = candidates[int(np.argmax(weights))]
     sigma = float(np.sqrt(weights @ (np.array([one.sigma for one in candidates]) ** 2 + (at - focus) ** 2)))
     return replace(best, at=focus, sigma=sigma)
-
-
-def _with_window(
-    vertex: Vertex | None, position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float
-) -> Vertex | None:
-    """Add to a vertex' error how it moves with the window, which tells more than the scatter of neighbours."""
-    if vertex is None:
-        return None
-    narrow = fit_vertex(position, log_energy, 0.7 * half_width)
-    moved = 0.5 * half_width if narrow is None else abs(narrow.at - vertex.at)
-    return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from elpd.vision.astigmatism import edges_of
 from elpd.vision.bands import BandFocus, average_focus
 from elpd.vision.drift import LOOKS, Drift, find_drift
 from elpd.vision.image_focus import band_energy_image, image_focus, sharpness_curves, typical_slowness, who_turns
@@ -167,6 +168,9 @@ def ask_events(
         # Edges that move make mirrors wherever they go, those of bright pixels at other times than those of dark ones.
         lag, pairs_lag = expected, late.unasked
         pairs = None if pairs is None else replace(pairs, at=pairs.at + late.typical.at - pairs_lag.at)
+    if pairs is not None and image is not None and image.astigmatism is not None:
+        shift, sigma = image.astigmatism.shift(late.towards)
+        pairs = replace(pairs, at=pairs.at - shift, sigma=float(np.hypot(pairs.sigma, sigma)))
     return EventWitnesses(
         None if image is None else replace(image, at=image.at - lag.at),
         pairs,
@@ -174,6 +178,7 @@ def ask_events(
         LEAST_LEVEL * band_gain(BANDS_PX[0]) / max(seen, 1e-12),
         drift=drift,
         expected_lag=expected,
+        turns=late.turns,
         in_focus=light.focused,
         pairs_lag=pairs_lag.at,
     )
@@ -197,12 +202,13 @@ def _sharpest(
     # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
     # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
     below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
+    edges = [edges_of(image, light.weight, events.margin) for image in images]
     bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(light.worths) * [below]]
     curves = quiet if still else loud if drift.seen else loud + quiet
     candidates = [
         one
         for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
-        if (one := image_focus(curve, ticks, peak, count)) is not None and (one.as_blur or not drift.seen)
+        if (one := image_focus(curve, ticks, peak, count, edges)) is not None and (one.as_blur or not drift.seen)
     ]
     return average_focus(candidates) if candidates else None, drift
 

@@ -46,6 +46,7 @@ from elpd.vision.elp_windows import (
     ROW_DTYPE,
     new_window,
 )
+from elpd.vision.elp_words import new_buckets
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -75,6 +76,9 @@ class ElpWindows:
         time stamp. Events before it are counted as early.
     rate_cap : bool
         Refuse the events of a pixel beyond 8 within a leaky 5 ms (``elp_words.CAP_EVENTS``, ``CAP_US``).
+    support_us : int
+        Beside the rate cap, refuse events that no other pixel of their 2x2 cell fired so shortly before
+        (``elpd.vision.background``); 0: do not. Only with *rate_cap*.
 
     Notes
     -----
@@ -90,6 +94,7 @@ class ElpWindows:
         window_us: int | None = None,
         origin_us: int | None = None,
         rate_cap: bool = False,
+        support_us: int = 0,
     ) -> None:
         if window_us is not None and window_us < 1:
             raise UsageError(f"a window must last 1 us at least; got {window_us}")
@@ -102,7 +107,9 @@ class ElpWindows:
         self._closed = self._rows.view(ROW_DTYPE).reshape(-1)
         self._state = new_state()
         self._triggers = new_triggers()
-        self._bucket = np.full(self._table.shape[0] if rate_cap else 1, NEVER, np.int64)
+        if support_us < 0 or (support_us > 0 and not rate_cap):
+            raise UsageError(f"support_us is 0 or more, and goes with rate_cap; got {support_us}")
+        self._bucket = new_buckets(self._table.shape[0] if rate_cap else 1, support_us)
         self._arrays = elp_addresses.arrays_to_windows_capped if rate_cap else elp_addresses.arrays_to_windows
         self._pending = elp_lanes.scratch()
         self._words = (

@@ -24,10 +24,11 @@ from elpd.events.evt2 import (
 )
 from elpd.events.jit import kernel
 from elpd.events.registers import BEFORE_TIME, HIGH, LOOP, LOW, MAX_SIDE, Integer
+from elpd.records import Encoding
 from elpd.vision.elp_lanes import sum_list
 from elpd.vision.elp_weights import STRIDE
 from elpd.vision.elp_windows import BEGIN, LENGTH, NEVER, move_to
-from elpd.vision.elp_words import sum_capped
+from elpd.vision.elp_words import served, sum_capped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,7 +67,7 @@ def sum_events(
 
 
 def _build_arrays(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
-    @kernel(*ARRAYS_SIGNATURES)
+    @kernel(*ARRAYS_SIGNATURES, serves=served(Encoding.ARRAY, capped=capped))
     def arrays_to_windows(
         ts: NDArray[np.int64],
         xs: NDArray[np.uint16],
@@ -134,7 +135,10 @@ def finish(
 
 
 def _build_evt2(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
-    @kernel(f"int64({EVT2_WORDS}, int64, int64[::1], int64[:, ::1], {_WINDOWS})")
+    @kernel(
+        f"int64({EVT2_WORDS}, int64, int64[::1], int64[:, ::1], {_WINDOWS})",
+        serves=served(Encoding.EVT2, capped=capped),
+    )
     def evt2_to_windows(
         words: NDArray[np.uint32],
         position: int,
@@ -195,7 +199,10 @@ def _build_evt2(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile
 
 
 def _build_evt21(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
-    @kernel(f"int64({EVT21_WORDS}, int64, int64[::1], int64[:, ::1], {_WINDOWS})")
+    @kernel(
+        f"int64({EVT21_WORDS}, int64, int64[::1], int64[:, ::1], {_WINDOWS})",
+        serves=served(Encoding.EVT21, capped=capped),
+    )
     def evt21_to_windows(
         words: NDArray[np.uint64],
         position: int,

@@ -17,6 +17,7 @@ from elpd.events.evt3_lists import COLUMNS, LISTS, LOWS, ROWS, TIMES
 from elpd.events.jit import kernel
 from elpd.events.registers import HIGH, LOOP, LOW
 from elpd.events.simd import available
+from elpd.records import Encoding
 from elpd.vision.elp_gather import to_addresses, weigh, weigh_pixels, widen
 from elpd.vision.elp_weights import OUT_OF_SENSOR_WEIGHT, OUTSIDE_WEIGHT, STRIDE
 from elpd.vision.elp_windows import BEGIN, ELP, ENERGY, LENGTH, N_OFF, N_ON, OUT_OF_SENSOR, OUTSIDE, move_to
@@ -25,6 +26,7 @@ from elpd.vision.elp_words import (
     SIGNATURE,
     evt3_to_windows,
     evt3_to_windows_capped,
+    served,
     sum_capped,
     sum_pending,
 )
@@ -72,7 +74,7 @@ else:
 
 def _build_evt3(capped: bool) -> Callable[..., int]:  # noqa: FBT001  (a compile-time constant of the kernel)
     # Kernels are named below and not closed over, because numba's cache cannot know a kernel in a closure again.
-    @kernel(SIGNATURE)
+    @kernel(SIGNATURE, serves=served(Encoding.EVT3, capped=capped))
     def evt3_to_windows_by_blocks(
         words: NDArray[np.uint16],
         position: int,

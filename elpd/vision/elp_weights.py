@@ -8,14 +8,13 @@ makes any shape of region, and a mask of hot pixels, cost the same as a rectangl
 
 from __future__ import annotations
 
-import mmap
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from elpd.errors import UsageError
 from elpd.events.registers import MAX_SIDE
+from elpd.vision.large_pages import in_large_pages
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,8 +25,6 @@ STRIDE = MAX_SIDE + 64
 OUT_OF_SENSOR_WEIGHT = -32768
 OUTSIDE_WEIGHT = -32767
 MAX_WEIGHT = 32766
-
-LARGE_PAGE = 1 << 21
 
 
 def weight_table(weights: NDArray[Any], inside: NDArray[np.bool_] | None = None) -> NDArray[np.int16]:
@@ -63,23 +60,7 @@ def weight_table(weights: NDArray[Any], inside: NDArray[np.bool_] | None = None)
     if largest > MAX_WEIGHT:
         raise UsageError(f"a weight of magnitude {largest} exceeds {MAX_WEIGHT}; scale the reference down")
     height, width = weights.shape
-    table = _in_large_pages((height + 1) * STRIDE).reshape(-1, STRIDE)
+    table = in_large_pages((height + 1) * STRIDE, np.int16).reshape(-1, STRIDE)
     table[:] = OUT_OF_SENSOR_WEIGHT
     table[:height, :width] = np.where(inside, weights, OUTSIDE_WEIGHT)
     return table.reshape(-1)
-
-
-def _in_large_pages(size: int) -> NDArray[np.int16]:
-    """Return room for a table, in one or two large pages if the system has them and the table is no small one.
-
-    After a wait the processor remembers neither the table nor where its pages are, and events of a sparse packet lie on
-    as many small pages as there are events.
-    """
-    if 2 * size < LARGE_PAGE // 2:
-        return np.empty(size, np.int16)
-    memory = mmap.mmap(-1, 2 * size + 2 * LARGE_PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    with suppress(OSError, AttributeError):  # without them, small pages do
-        memory.madvise(mmap.MADV_HUGEPAGE)
-    room = np.frombuffer(memory, np.uint8)
-    begin = -room.ctypes.data % LARGE_PAGE
-    return room[begin : begin + 2 * size].view(np.int16)

@@ -12,7 +12,11 @@ from elpd.vision.planes import FLANK
 from elpd.vision.slowness import DARK
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    from elpd.vision.astigmatism import Edges
 
 UNANSWERED = 0.23
 """The last part of a record, in widths, whose pixels have turned but not yet answered."""
@@ -71,9 +75,16 @@ def sharpness_curves(
 
 
 def image_focus(
-    curve: NDArray[np.float64], ticks: NDArray[np.float64], peak: float, bands: int = len(BANDS_PX)
+    curve: NDArray[np.float64],
+    ticks: NDArray[np.float64],
+    peak: float,
+    bands: int = len(BANDS_PX),
+    edges: Sequence[Edges] | None = None,
 ) -> BandFocus | None:
-    """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record."""
+    """Find the focus of a curve of log S, (ticks, bands), but for what lies too near the end of the record.
+
+    *edges* are those of the image at each tick.
+    """
     end = float(ticks[-1])
     wide = fit_vertex(ticks, curve[:, 0], end - float(ticks[0]))
     if wide is None:
@@ -81,7 +92,8 @@ def image_focus(
     use = ticks <= end - UNANSWERED * wide.width
     if int(use.sum()) < 5:
         return None
-    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands)
+    edges = None if edges is None else edges[: int(use.sum())]
+    found = focus_of_bands(ticks[use], curve[use], 0.7 * wide.width, bands, edges, of_events=True)
     if found is None or found.finest.at > end - (UNANSWERED + 0.2) * found.finest.width:
         return None
     # The flank that led up to the peak is as wide as the curve; a dent in it is not the curve.

@@ -14,7 +14,7 @@ mismatch between pixels adds a pattern that is white in space; ``elpd.vision.ban
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -232,6 +232,17 @@ def fit_vertex(position: NDArray[np.float64], log_energy: NDArray[np.float64], h
             break
         at = result.at
     return result
+
+
+def with_window(
+    vertex: Vertex | None, position: NDArray[np.float64], log_energy: NDArray[np.float64], half_width: float
+) -> Vertex | None:
+    """Add to a vertex' error how it moves with the window, which tells more than the scatter of neighbours."""
+    if vertex is None:
+        return None
+    narrow = fit_vertex(position, log_energy, 0.7 * half_width)
+    moved = 0.5 * half_width if narrow is None else abs(narrow.at - vertex.at)
+    return replace(vertex, sigma=float(np.hypot(vertex.sigma, 0.7 * moved)))
 
 
 def _parabola(position: NDArray[np.float64], log_energy: NDArray[np.float64]) -> Vertex | None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elpd.vision.background import BackgroundActivity
 from elpd.vision.crossing import LEAST_LEVEL, ROI_MARGIN_PX, ask_events
 from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
@@ -76,6 +77,8 @@ class EventMemory:
         What a calibration knows: hot pixels are not heard, the lag is not guessed.
     start:
         The image that earlier events have built, upon which these go on building.
+    support_us:
+        Events that no other pixel of their cell fired so shortly before are not heard; 0: all are.
     """
 
     def __init__(
@@ -86,12 +89,16 @@ class EventMemory:
         hot: NDArray[np.bool_] | None = None,
         sensor: SensorProfile | None = None,
         start: BuiltImage | None = None,
+        support_us: int = 0,
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
         self._bottom = min(geometry.height, roi.y + roi.height + ROI_MARGIN_PX)
         height, width = self._bottom - self._top, self._right - self._left
         self._cap = PixelCap(height, width)
+        self._background = (
+            BackgroundActivity(height, width, support_us, left=self._left, top=self._top) if support_us else None
+        )
         self._sensor = sensor
         for x, y in sensor.hot_pixels if sensor is not None else ():
             if self._left <= x < self._right and self._top <= y < self._bottom:
@@ -104,12 +111,13 @@ class EventMemory:
         self._taken = 0
         self._max_events = max_events
         self.track = PeakTrack()
+        self._raw: list[float] = []
         self._forgotten = 0 if start is None else start.events
         self._hot = None if hot is None or not hot.any() else hot
         self.capped = 0
         self.depths: tuple[float, ...] = ()
         """Where planes of the region are in focus, nearest first along the sweep, if ``witnesses`` found several."""
-        self._least_log_energy = float(np.log(LEAST_LEVEL * band_gain(BANDS_PX[0])))
+        self._least_energy = LEAST_LEVEL * band_gain(BANDS_PX[0])
 
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
@@ -120,6 +128,8 @@ class EventMemory:
         x = (x[inside] - self._left).astype(np.uint16)
         y = (y[inside] - self._top).astype(np.uint16)
         keep = self._cap.keep(t_us, x, y)
+        if self._background is not None:
+            keep[keep] = self._background.keep(t_us[keep], x[keep], y[keep])
         self.capped += int(keep.size - keep.sum())
         count = int(keep.sum())
         self._make_room(count)
@@ -224,12 +234,13 @@ class EventMemory:
         self._energy.add(x[part], y[part], on[part])
         self._taken = until
         self.track.add(until_us, position, self._energy.measure())
+        self._raw.append(self._energy.raw)
 
     @property
     def peak_passed(self) -> bool:
         """Whether the image has become as sharp as it gets, and duller again, by enough events to believe it."""
         track = self.track
-        if not track.passed or track.rise < MIN_RISE or track.values[track.peak] < self._least_log_energy:
+        if not track.passed or track.rise < MIN_RISE or self._raw[track.peak] < self._least_energy:
             return False
         if not self._shows_a_picture():
             return False
@@ -243,13 +254,13 @@ class EventMemory:
         on both sides of the peak.
         """
         track = self.track
-        energies = np.exp(track.values[: track.peak + 1])
+        energies = self._raw[: track.peak + 1]
         lowest = int(np.argmin(energies))
         begin, end = (int(np.searchsorted(self._t_us, track.times_us[k], side="left")) for k in (lowest, track.peak))
         begin = 0 if lowest == 0 else begin
         height, width = self._shape
         at_random = band_gain(BANDS_PX[0]) * (end - begin) / (height * width)
-        gained = float(energies[-1]) - (0.0 if self._start is None and lowest == 0 else float(energies[lowest]))
+        gained = energies[-1] - (0.0 if self._start is None and lowest == 0 else energies[lowest])
         return gained > LEAST_ORDER * at_random
 
     def ask(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from elpd.vision.astigmatism import directions
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
 from elpd.vision.pairs import Mode, Pairs, weighted_mode
 from elpd.vision.turns import Slowness, Turns, blocks_of
@@ -51,6 +52,10 @@ class Lateness:
     """What it makes of the pixels that turned, on the average."""
     unasked: Lag
     """The same if no pair had been asked."""
+    towards: NDArray[np.float64]
+    """Where the edges point whose pairs agree: the means of cos 2θ and sin 2θ, (2,)."""
+    turns: Turns | None = None
+    """The pairs that were asked."""
 
 
 def pair_mode(
@@ -82,7 +87,7 @@ def pair_mode(
     mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
     if mode is None:
         unknown = [lag_of(None, unmeasured_lag / float(one.times.mean()), calibrated) for one in slownesses]
-        return None, Lateness(unknown, np.ones(len(unknown)), unknown[0], unknown[0])
+        return None, Lateness(unknown, np.ones(len(unknown)), unknown[0], unknown[0], np.zeros(2))
     x, y = pairs.x[believed], pairs.y[believed]
     turns = Turns(middle, gap, weights, blocks_of(x, y, level.shape), mode.at, PAIRS_KERNEL * past, reach, smooth)
     slow = [one.at(y, x) for one in slownesses]
@@ -108,7 +113,8 @@ def pair_mode(
     lag = as_known(lags) if focused else average_lag(lags, fit)
     nothing = lag_of(None, unmeasured_lag / usual[0], calibrated)
     unasked = Lag(usual[0] * nothing.at, usual[0] * nothing.sigma)
-    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked)
+    towards = np.average(directions(level)[y, x], axis=0, weights=turns.near)
+    return replace(mode, at=mode.at - lag.at), Lateness(late, fit, lag, unasked, towards, turns)
 
 
 def as_known(lags: list[Lag]) -> Lag:

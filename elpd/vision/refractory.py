@@ -10,7 +10,8 @@ Nobody knows the period of a given sensor and bias; but no two events of one pix
 it that some nearly are. Just above the period the intervals are evenly spread, so the shortest ones, less what their
 number leaves to expect, are the period, and their scatter its error. Where there is hardly any noise the shortest
 interval is set by the steepest edge in view instead; then the intervals above it crowd, and nothing is learnt but a
-bound: the period is anything below it, evenly.
+bound: the period is anything below it, evenly. So it is where stamps lie on a grid: intervals are as long as the grid
+makes them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.events.jit import kernel
+from elpd.vision.flicker import stamp_grid_us
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,30 +33,24 @@ ORDER = 5
 
 KEPT = 512
 MIN_INTERVALS = 5_000
-MAX_PERIOD_US = 5_000.0
-"""Beyond this nobody sets it for focusing, and a shortest interval so long only says that there are few events."""
-
 GRID_COUNT = 250
-"""So many intervals exactly alike and shortest, and the time stamps are on a grid: it hides the period."""
+"""So many intervals exactly alike and shortest, and the time stamps are on a grid too, whatever most of them do."""
 
-EVEN_OVER = 69
 FEWEST_ABOVE = 8
 EVEN_SIGMAS = 2.0
-"""So many intervals above the shortest are looked at, and must not crowd towards their end by so many deviations."""
+"""So many intervals must lie above the shortest, up to half as long again, and not crowd towards their end by so many
+standard deviations. One steep edge makes several alike at the start, so all that are kept are looked at."""
 
 TOGETHER_US = 16.0
 """Closer together than this all of them are at the period, and whole microseconds say nothing of how they lie."""
 
-UNKNOWN_US = 500.0
-"""Standard deviation of a period of which nothing is learnt: sensors are set to some tenths of a millisecond."""
-
 MOST_US = 1_000.0
-"""So long a period nobody sets for focusing: a bound above it says nothing more."""
+"""So long a period nobody sets for focusing: shortest intervals above it are those of the scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refractory:
-    """A refractory period and one standard error, us; both zero where the events say nothing at all."""
+    """A refractory period and one standard error, us; both zero where nothing need be said."""
 
     period_us: float = 0.0
     sigma_us: float = 0.0
@@ -107,14 +103,14 @@ def refractory_period(
     shortest_us = np.full(KEPT, np.iinfo(np.int64).max)
     count = shortest_intervals(t_us, x, y, last_us, shortest_us)
     least_us = float(shortest_us[ORDER - 1])
-    if count < MIN_INTERVALS or least_us > MAX_PERIOD_US or shortest_us[0] == shortest_us[GRID_COUNT]:
-        return Refractory()
-    top_us = min(1.5 * least_us, float(shortest_us[-1]))
-    above = (shortest_us[ORDER:EVEN_OVER] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
-    above = above[: max(FEWEST_ABOVE, int(np.searchsorted(above, 1.0, side="right")))]
     bound_us = min(least_us, MOST_US)
     only_bounded = Refractory(0.5 * bound_us, bound_us / sqrt(12.0))
-    if above.size < FEWEST_ABOVE:
+    if count < MIN_INTERVALS or least_us > MOST_US or shortest_us[0] == shortest_us[GRID_COUNT]:
+        return only_bounded
+    top_us = min(1.5 * least_us, float(shortest_us[-1]))
+    above = (shortest_us[ORDER:] - least_us) / (top_us - least_us) if top_us > least_us else np.empty(0)
+    above = above[: max(FEWEST_ABOVE, int(np.searchsorted(above, 1.0, side="right")))]
+    if above.size < FEWEST_ABOVE or _on_a_grid(shortest_us, t_us):
         return only_bounded
     # Evenly spread, they lie at half their range on average; what is set by edges in view crowds towards its end.
     reach = max(float(above.max()), 1.0 / (top_us - least_us))
@@ -123,3 +119,8 @@ def refractory_period(
         return only_bounded
     per_us = float(above.size / (reach * (top_us - least_us)))
     return Refractory(max(0.0, least_us - ORDER / per_us), min(only_bounded.sigma_us, sqrt(ORDER) / per_us))
+
+
+def _on_a_grid(shortest_us: NDArray[np.int64], t_us: NDArray[np.int64]) -> bool:
+    """Whether a grid of time stamps, not the pixels, sets intervals: most are alike, and most stamps far apart."""
+    return np.unique(shortest_us).size < shortest_us.size // 2 and stamp_grid_us(t_us) > TOGETHER_US

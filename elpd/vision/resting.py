@@ -257,19 +257,16 @@ def _box(roi: Roi, geometry: Geometry, margin: int) -> NDArray[np.bool_]:
 
 def hot_pixels(count: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which pixels fired far more often than any two of their neighbours; *count* is (height, width)."""
-    height, width = count.shape
+    hot = np.zeros(count.shape, np.bool_)
+    rows, columns = np.nonzero(count > HOT_EVENTS)  # of a sensor at rest few come into question
+    if rows.size == 0:
+        return hot
     wide = np.pad(count, 1)
-    highest = np.zeros_like(count)
-    second = np.zeros_like(count)
-    for row in range(3):
-        for column in range(3):
-            if row == column == 1:
-                continue
-            one = wide[row : row + height, column : column + width]
-            second = np.maximum(second, np.minimum(highest, one))
-            highest = np.maximum(highest, one)
+    around = [wide[rows + row, columns + column] for row in range(3) for column in range(3) if (row, column) != (1, 1)]
+    second = np.partition(around, -2, axis=0)[-2]
     expected = second + float(count.mean())
-    return np.asarray(count - second > HOT_EVENTS + HOT_SIGMAS * np.sqrt(expected), np.bool_)
+    hot[rows, columns] = count[rows, columns] - second > HOT_EVENTS + HOT_SIGMAS * np.sqrt(expected)
+    return hot
 
 
 def order(levels: NDArray[np.float32]) -> float:

@@ -26,14 +26,14 @@ import numpy as np
 from elpd.errors import FormatError, UsageError
 from elpd.records import TemporalImage
 from elpd.units import SensorUs
-from elpd.vision.first_events import EMPTY
+from elpd.vision.latch import EMPTY
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from elpd.vision.first_events import FirstTimes
+    from elpd.vision.first_times import FirstTimes
 
 LARGE_HOLE_PX = 64
 """A hole of more unfired pixels is an unlit part of the scene; a smaller one is a flaw to be mended."""

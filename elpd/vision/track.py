@@ -6,17 +6,20 @@ drawn from frames (the sharpest witness where there are any) and from the image 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from elpd.vision.bands import band_energies, focus_of_bands
+from elpd.vision.astigmatism import Edges, edges_of
+from elpd.vision.bands import CORNER, band_energies, focus_of_bands
 from elpd.vision.drift import shift_px
 from elpd.vision.integral import (
     BANDS_PX,
     Vertex,
+    band_gain,
     band_image,
     band_stamp,
     fit_vertex,
@@ -52,7 +55,19 @@ USUAL_THRESHOLD = 0.2
 POINT = np.ones((1, 1), np.float32)
 """The stamp that adds an event to nothing but its own pixel."""
 
+CHANCE_SIGMAS = 3.0
+"""What noise leaves of S, once it is subtracted, is told from nothing only beyond so many standard deviations."""
+
 _FLOOR = 1e-12
+_GAIN = band_gain(BANDS_PX[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """What a frame shows: log S in each band, (bands,), and where its edges point."""
+
+    bands: NDArray[np.float64]
+    edges: Edges | None = None
 
 
 class PeakTrack:
@@ -62,15 +77,15 @@ class PeakTrack:
         self.times_us: list[int] = []
         self.positions: list[float] = []
         self.values: list[float] = []
-        self._bands: list[NDArray[np.float64]] = []
+        self._sharpness: list[Sharpness] = []
         self._peak = 0
         self._lowest_before_peak = float("inf")
         self._lowest = float("inf")
 
-    def add_bands(self, t_us: int, position: float, bands: NDArray[np.float64]) -> None:
+    def add_sharpness(self, t_us: int, position: float, sharpness: Sharpness) -> None:
         """Append a point of which all bands are known: the finest is the curve, all of them tell the focus."""
-        self._bands.append(bands)
-        self.add(t_us, position, float(bands[0]))
+        self._sharpness.append(sharpness)
+        self.add(t_us, position, float(sharpness.bands[0]))
 
     def add(self, t_us: int, position: float, value: float) -> None:
         """Append a point; times rise."""
@@ -158,16 +173,22 @@ class PeakTrack:
 
     def focus(self) -> BandFocus | None:
         """Return the focus of parabolas through what lies within ``FIT_DROP`` of the peak, of points with all bands."""
-        if len(self._bands) != len(self) or len(self) < 3:
+        if len(self._sharpness) != len(self) or len(self) < 3:
             return None
         begin = self.flank(2.0 * FIT_DROP)
         z = np.array(self.positions[begin:])
-        bands = np.array(self._bands[begin:])
+        bands = np.array([one.bands for one in self._sharpness[begin:]])
+        edges = [one.edges for one in self._sharpness[begin:] if one.edges is not None]
         sign = -1.0 if z[-1] < z[0] else 1.0
         wide = fit_vertex(sign * z, bands[:, 0], float(np.ptp(z)))
         if wide is None:
             return None
-        found = focus_of_bands(sign * z, bands, wide.width * float(np.sqrt(2.0 * FIT_DROP)))
+        found = focus_of_bands(
+            sign * z,
+            bands,
+            wide.width * float(np.sqrt(2.0 * FIT_DROP)),
+            edges=edges if len(edges) == z.size else None,
+        )
         return None if found is None else found.mirrored(sign)
 
 
@@ -193,8 +214,8 @@ class FrameEnergy:
         self._before: NDArray[np.float32] | None = None
         self._shift_px = np.zeros(2)
 
-    def measure(self, pixels: NDArray[np.generic]) -> NDArray[np.float64]:
-        """Return log S of a frame, 8 or 16 bit, in each band."""
+    def measure(self, pixels: NDArray[np.generic]) -> Sharpness:
+        """Return log S of a frame, 8 or 16 bit, in each band, and where its edges point."""
         roi, margin = self._roi, self._margin
         top, left = max(0, roi.y - margin), max(0, roi.x - margin)
         part = pixels[top : roi.y + roi.height + margin, left : roi.x + roi.width + margin]
@@ -205,8 +226,8 @@ class FrameEnergy:
         inside = np.zeros_like(image)
         inside[roi.y - top : roi.y - top + roi.height, roi.x - left : roi.x - left + roi.width] = 1.0
         levels = np.log(image + np.float32(FRAME_GROUND))
-        energies = band_energies(levels, weight * self._moved(inside, levels))
-        return np.asarray(np.log(energies + _FLOOR))
+        weight = weight * self._moved(inside, levels)
+        return Sharpness(np.log(band_energies(levels, weight) + _FLOOR), edges_of(levels, weight))
 
     def _moved(self, inside: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the region's mask where its scene has gone to."""
@@ -227,20 +248,50 @@ class EventEnergy:
     The band-passed image is what is measured: an event adds the band's impulse response around its pixel, a hundred
     products, and a look at the sharpness is a sum of squares. Filtering the image anew at every look would cost the
     whole region each time, at 4 mm/s more than a thousand times a second.
+
+    Noise events walk at random, so what they add to S grows as long as the sweep lasts, and in dim light hides that
+    focus is over. It is white: the band next to the sampling limit tells how much of it there is (``vision.bands``),
+    and that is subtracted.
     """
 
     def __init__(self, height: int, width: int, margin: int, start: NDArray[np.float32] | None = None) -> None:
         self.image = np.zeros((height, width), dtype=np.float32) if start is None else start.copy()
         """The image itself, in thresholds."""
-        self._band = np.zeros((height, width), dtype=np.float32) if start is None else band_image(start, BANDS_PX[0])
-        self._stamp = band_stamp(BANDS_PX[0])
+        self._bands = [np.zeros((height, width), np.float32) for _ in range(2)] if start is None else _fine(start)
+        self._stamps = (band_stamp(BANDS_PX[0]), CORNER)
         self._inside = inside_margin((height, width), margin)
+        pixels = self.image[self._inside].size
+        self._by_chance = CHANCE_SIGMAS * float(np.sqrt(2.0 * _freed_patch() / pixels))
+        self.raw = 0.0
+        """S at the last look, with its noise."""
 
     def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Take events, in coordinates of the image."""
-        stamp_events(x, y, on, self._stamp, self._band)
+        for stamp, band in zip(self._stamps, self._bands, strict=True):
+            stamp_events(x, y, on, stamp, band)
         stamp_events(x, y, on, POINT, self.image)
 
     def measure(self) -> float:
-        """Return log S now."""
-        return float(np.log(np.square(self._band[self._inside]).mean(dtype=np.float64) + _FLOOR))
+        """Return log S now, freed of white noise as far as chance lets it be told."""
+        self.raw, corner = (_mean_square(band[self._inside]) for band in self._bands)
+        noise = min(_GAIN * corner, self.raw)
+        return float(np.log(max(self.raw - noise, self._by_chance * noise) + _FLOOR))
+
+
+def _fine(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    corner = np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)
+    return [band_image(image, BANDS_PX[0]), corner]
+
+
+def _mean_square(values: NDArray[np.float32]) -> float:
+    return float(np.square(values).mean(dtype=np.float64))
+
+
+@cache
+def _freed_patch() -> float:
+    """Return the variance of S of white noise, freed of noise, as the patch of pixels that count as one sample."""
+    size = 65
+    impulse = np.zeros((size, size), dtype=np.float32)
+    impulse[size // 2, size // 2] = 1.0
+    band, corner = (np.square(np.abs(np.fft.fft2(one))) for one in _fine(impulse))
+    return float(np.square(band - _GAIN * corner).mean() / band.mean() ** 2)

@@ -57,6 +57,9 @@ BIWEIGHT = 4.685
 LEAST_CUT = 1e-3
 """Where the biweight ends at the least, over how far pairs are asked: no midpoint is known better."""
 
+MOST = 0.95
+"""Share of the pairs that counts as most of them."""
+
 _BENDS = 4
 _ROUNDS = 12
 _AGAIN = 4
@@ -140,6 +143,17 @@ class Turns:
     def near(self) -> NDArray[np.float64]:
         """The weights of those about the mode."""
         return np.asarray(self.weights * (np.abs(self.middle - self.mode) <= 2.0 * self.width), dtype=np.float64)
+
+    @property
+    def begin(self) -> float:
+        """How far before the mode most pairs about it begin: with their first event."""
+        weights = self.near
+        before = self.mode - (self.middle - 0.5 * self.gap)
+        order = np.argsort(before)
+        summed = np.cumsum(weights[order])
+        if not summed.size or summed[-1] <= 0.0:
+            return 0.0
+        return float(before[order[int(np.searchsorted(summed, MOST * summed[-1]))]])
 
     def line(self, slowness: Slowness) -> tuple[Line | None, NDArray[np.float64]]:
         """Return the line of midpoints against how late pixels can be, ``None`` if there is none; and how late, (n,).

@@ -19,6 +19,7 @@ from elpd.records import FocusEstimate
 from elpd.vision.drift import Drift
 from elpd.vision.lag import Lag
 from elpd.vision.planes import MIN_PAIRS
+from elpd.vision.relief import halves_apart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from elpd.vision.bands import BandFocus
     from elpd.vision.integral import Vertex
     from elpd.vision.pairs import Mode
+    from elpd.vision.turns import Turns
 
 WIDTHS_PER_DEPTH_OF_FOCUS = 5.0
 """Width of the log S parabola over the depth of focus, for a ray-traced F/2 lens and for Gaussian blur."""
@@ -76,11 +78,15 @@ class Witness:
     play: float = 0.0
     freed: float = 0.0
     """How much lag was taken off ``at``."""
+    astray: float = 0.0
+    """What pairs that turn elsewhere add to the error: a region with several depths would have them, or motion."""
+    apart: float = 0.0
+    """What it is in a region that is known to be flat: how far apart halves of it put their modes."""
 
     @property
     def total_sigma(self) -> float:
         """All errors together."""
-        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play]))
+        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play, self.astray]))
 
     def on_the_way_back(self, play: float, play_sigma: float) -> Witness:
         """Return what a pass in the opposite direction said, on the ruler of the sweep.
@@ -118,6 +124,8 @@ class EventWitnesses:
     """What the image would have been freed of if no pair had been asked."""
     pairs_lag: float = 0.0
     """What the pairs were freed of: they need not be of the pixels that the image shows."""
+    turns: Turns | None = None
+    """The pairs themselves, as they were asked."""
     in_focus: bool = False
     """Whether bright was told from dark by the picture as it is in focus, not by one that was blurred."""
 
@@ -144,9 +152,11 @@ class EventWitnesses:
             held = SYSTEMATIC_IMAGE * dull
             found.append(Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at))
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
-            systematic = np.hypot((SYSTEMATIC_PAIRS + stray) * width, PAIRS_DEPART * departure)
-            sigma = float(np.hypot(self.pairs.sigma, systematic))
-            found.append(Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag))
+            parts = [self.pairs.sigma, SYSTEMATIC_PAIRS * width, PAIRS_DEPART * departure]
+            sigma, astray = float(np.linalg.norm(parts)), stray * width
+            apart = 0.0 if self.turns is None else halves_apart(self.turns)
+            pairs = Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag, astray=astray, apart=apart)
+            found.append(pairs)
         return found
 
 
@@ -179,7 +189,7 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
         return None
     at = np.array([one.at for one in witnesses])
     common = np.array([(one.shared, one.held, one.play) for one in witnesses])
-    covariance = np.diag([one.sigma**2 for one in witnesses]) + common @ common.T
+    covariance = np.diag([one.sigma**2 + one.astray**2 for one in witnesses]) + common @ common.T
     precision = np.linalg.inv(covariance)
     share = precision.sum(axis=0) / precision.sum()
     focus = float(share @ at)

@@ -8,6 +8,7 @@ const roi = await from("roi");
 const curve = await from("curve");
 const store = await from("store");
 const { parse } = await from("stream");
+const trend = await from("trend");
 const words = await from("words");
 
 const SENSOR = { width: 1280, height: 720 };
@@ -157,4 +158,29 @@ test("numbers read well, and what is not known is a dash", () => {
   assert.equal(words.adviceTitle("losing-events"), "Events are lost");
   assert.equal(words.adviceTitle("map-not-kept"), "Map not kept");
   assert.equal(words.outcomeText("NO_TEXTURE"), "No texture in the region");
+});
+
+const RUNS = [
+  { outcome: "FOCUSED", final_um: 1560.4, focus_um: 1560.9, sigma_um: 1.1, duration_ms: 260 },
+  { outcome: "NO_CROSSING", final_um: 1300, focus_um: null, sigma_um: null, duration_ms: 600 },
+  { outcome: "CANCELLED", final_um: 1400, focus_um: null, sigma_um: null, duration_ms: 90 },
+  { outcome: null, final_um: null, focus_um: null, sigma_um: null, duration_ms: null },
+  { outcome: "FOCUSED", final_um: null, focus_um: 1558.0, sigma_um: 0.9, duration_ms: 240 },
+];
+
+test("a trend goes from the oldest run to the newest, and only focus has a place", () => {
+  const shown = trend.series(RUNS, "rest");
+  assert.deepEqual(shown.good, [1558.0, null, null, null, 1560.4]);
+  assert.deepEqual(shown.error, [0.9, null, null, null, 1.1]);
+  assert.deepEqual(shown.bad, [null, 0, null, 0, null]); // a cancelled run is no failure
+  assert.deepEqual(trend.series(RUNS, "took").good, [240, null, null, null, 260]);
+  assert.deepEqual(trend.series(RUNS, "took").error, [null, null, null, null, null]);
+});
+
+test("a trend is told in words", () => {
+  assert.equal(trend.summary(RUNS, "rest"), "2 of 4 in focus; at rest 1559.2 µm (median), 1558.0 to 1560.4.");
+  assert.equal(trend.summary(RUNS, "took"), "2 of 4 in focus; took 250 ms (median), 240 to 260.");
+  assert.equal(trend.summary(RUNS.slice(1, 2), "sigma"), "0 of 1 in focus.");
+  assert.equal(trend.summary(RUNS.slice(2, 3), "rest"), "All of these runs were cancelled.");
+  assert.equal(trend.median([]), null);
 });

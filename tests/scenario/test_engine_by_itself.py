@@ -256,3 +256,41 @@ class FakeNotifier:
 
     def alive(self) -> None:
         self.fed += 1
+
+
+FAR = ("sim.scene=random", "sim.seed=705", "journal.enabled=false")
+"""Focus lies 1.7 mm from the reference, where a picture shows nothing of the scene."""
+
+
+def test_a_lens_that_was_homed_far_away_is_brought_to_focus(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, *FAR).begin()
+    daemon.do("home")
+    daemon.do("mode", mode="continuous")
+    daemon.until(lambda: daemon.status.counters.focused == 1)
+    assert daemon.status.counters.not_focused == {"NO_CROSSING": 1}, "from the reference, and then from elsewhere"
+    assert abs(daemon.truth.carriage_error_um()) < 6.0
+
+
+def test_where_there_is_no_focus_the_travel_is_searched_once_and_the_lens_put_back(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, "sim.scene=flat", "journal.enabled=false", "modes.hold_off_s=0.01").begin()
+    daemon.do("home")
+    daemon.do("mode", mode="continuous")
+    seen = []
+    daemon.engine.listen(lambda event: seen.append(daemon.status.lens.position_um) if event.event == "result" else None)
+    daemon.run(10.0)
+    assert [round(place) for place in seen] == [0, 625, 1875, 0, 0, 0, 0]
+    assert "at places all over the lens's travel" in daemon.do("mode").hold["waits_for"]
+
+
+def test_a_search_over_the_travel_gives_way_to_a_stop(tmp_path: Path) -> None:
+    daemon = Daemon(tmp_path, "sim.scene=flat", "journal.enabled=false", "modes.hold_off_s=0.01").begin()
+    daemon.do("home")
+    daemon.do("mode", mode="continuous")
+    daemon.until(lambda: sum(daemon.status.counters.not_focused.values()) == 1)
+    daemon.after_ms(50.0, lambda: daemon.engine.stop() and None)
+    daemon.run(3.0)
+    at_um = daemon.status.lens.position_um
+    assert at_um is not None
+    assert 10.0 < at_um < 615.0, "on the way to the first place"
+    assert sum(daemon.status.counters.not_focused.values()) == 1
+    assert "somebody stopped the lens" in daemon.do("mode").hold["waits_for"]

@@ -15,6 +15,8 @@ from elpd.service.keeper import LAST_RETRY_S
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from engines import Asked
+
     from elpd.config import Config
     from elpd.ports import RigParts
 
@@ -232,6 +234,37 @@ def test_a_reload_waits_until_the_lens_rests(daemon: Daemon) -> None:
     daemon.engine.reload(daemon.config("sim.seed=4"))
     daemon.run(0.2)
     assert daemon.built == 2
+
+
+def test_another_camera_waits_for_its_kernels_and_so_does_who_asks_for_focus_meanwhile(tmp_path: Path) -> None:
+    prepared: list[tuple[str, list[str]]] = []
+
+    def prepare(config: Config) -> None:
+        prepared.append((config.sim.model_dump()["camera"], [warned.code for warned in daemon.status.warnings]))
+        asked.append(daemon.ask("focus"))
+
+    asked: list[Asked] = []
+    daemon = Daemon(tmp_path, prepare=prepare).begin()
+    assert daemon.do("focus").outcome == "FOCUSED"
+    assert prepared == [], "the first configuration's are there before the daemon begins"
+    daemon.engine.reload(daemon.config("sim.camera=davis346"))
+    daemon.until(lambda: bool(asked))
+    assert daemon.until_answered(asked[0]).result.outcome == "FOCUSED"
+    assert prepared == [("davis346", ["compiling"])], "once, and said"
+    assert not daemon.status.warnings
+
+
+def test_a_daemon_that_is_asked_to_end_while_it_compiles_ends(tmp_path: Path) -> None:
+    def prepare(config: Config) -> None:
+        del config
+        daemon.engine.begin_stopping()
+        raise SystemExit(0)
+
+    daemon = Daemon(tmp_path, prepare=prepare).begin()
+    daemon.engine.reload(daemon.config("sim.camera=davis346"))
+    daemon.engine.step()
+    daemon.engine.finish_stopping()
+    assert (daemon.built, daemon.status.state) == (1, "STOPPING")
 
 
 def test_a_journal_that_cannot_be_written_costs_the_journal_alone(tmp_path: Path) -> None:

@@ -28,6 +28,8 @@ def test_a_focus_request_ends_in_focus_and_everybody_hears_of_it(daemon: Daemon)
     assert (status.state, status.phase, status.counters.focused) == ("READY", None, 1)
     assert status.last is not None
     assert status.last.run == result.run
+    assert {"cycle", "sweep", "stop command", "sensor to host", "host to loop"} <= set(status.latency)
+    assert 166.0 <= status.latency["sensor to host"].p50_us < 400.0, "the least latency, and what batching adds"
     assert status.lens.position_um == pytest.approx(result.final_um, abs=0.4)
     assert [one.name for one in daemon.do("runs").runs] == [result.run]
     assert daemon.do("run", name=result.run).result["outcome"] == "FOCUSED"

@@ -36,3 +36,14 @@ def test_an_overload_that_takes_too_much_is_refused(after_ms: float) -> None:
     story = play("sim.seed=3", events=[Event("sweep", after_ms, waiting(200))])
     assert story.outcome is Outcome.EVENTS_LOST
     assert_invariants(story)
+
+
+def test_what_was_lost_while_the_sensor_was_at_rest_is_missing_in_no_sweep() -> None:
+    """As with a camera whose ring ran full while nobody read it yet."""
+    calm = play("sim.seed=3")
+    probed_ms = next(fields["at_ms"] for fields in calm.named("phase") if fields["name"] == "probe")
+    story = play("sim.seed=3", f"sim.drop_from_s={(probed_ms - 15.0) / 1e3}", "sim.drop_for_s=0.012")
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert story.result.lost > 100
+    assert_invariants(story)

@@ -19,14 +19,14 @@ from sockets import Talker, serving
 
 from elpd.config import ApiSection
 from elpd.errors import ConfigError, LensError
-from elpd.service import api, connection
+from elpd.service import connection, telling
 from elpd.service.api import MOST_CLIENTS, MOST_STOPPERS, ApiServer
 from elpd.service.desk import MOST_IN_FLIGHT
 from elpd.service.messages import FaultEvent, PhaseEvent, PositionEvent, SampleEvent, StateEvent
 from elpd.service.peers import Operators, Peer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 @pytest.fixture
@@ -238,17 +238,18 @@ def test_a_client_that_stands_still_is_dropped(
     engine.heard(lambda: engine.counts.dropped_clients == 1)
 
 
-def test_a_flood_of_events_leaves_out_samples_alone(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "MOST_EVENTS_WAITING", 10)
-    engine = FakeEngine()
-    server = ApiServer(engine, ApiSection(socket=path))
-    for number in range(30):  # nobody takes them: the server has not begun
-        server._hear(sample(number))
-        server._hear(PositionEvent(position_um=1.0, moving=True))
-    server._hear(PhaseEvent(phase="sweep"))
-    assert len(server._to_tell) == 11
-    assert server._dropped_events == 50
-    server.stop()
+def test_a_flood_of_events_leaves_out_samples_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(telling, "MOST_EVENTS_WAITING", 10)
+    turns: list[Callable[[], None]] = []
+    told = telling.Telling(list, turns.append, turns.append, lambda: None)
+    for number in range(30):  # nobody takes them meanwhile
+        told.event(sample(number))
+        told.event(PositionEvent(position_um=1.0, moving=True))
+    told.event(PhaseEvent(phase="sweep"))
+    assert (told.dropped, len(turns)) == (50, 1)
+    turns.pop()()
+    told.event(sample(31))
+    assert (told.dropped, len(turns)) == (50, 1), "room again, and woken again"
 
 
 # --- events ------------------------------------------------------------------------------------------------------

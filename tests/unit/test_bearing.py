@@ -235,8 +235,8 @@ def test_a_region_that_goes_with_its_scene_sees_the_same_sharpness() -> None:
     frames = [np.clip(120 + 100 * picture[20:116, 20 + k : 116 + k], 0, 255).astype(np.uint8) for k in range(0, 10, 2)]
     roi = Roi(32, 32, 32, 32)
     follows, stands = FrameEnergy(roi, 14, follow=True), FrameEnergy(roi, 14)
-    followed = [follows.measure(frame) for frame in frames]
-    stood = [stands.measure(frame) for frame in frames]
+    followed = [follows.measure(frame).bands for frame in frames]
+    stood = [stands.measure(frame).bands for frame in frames]
     assert (np.ptp(followed, axis=0) < 0.5 * np.ptp(stood, axis=0)).all()
 
 
@@ -246,5 +246,5 @@ def test_bright_parts_that_move_are_as_sharp_elsewhere() -> None:
     picture[:, 12:40] *= 3.0
     picture[:, 40:] = cv2.GaussianBlur(picture[:, 40:], (0, 0), 4.0)  # dark parts have less structure
     energy = FrameEnergy(Roi(0, 0, 96, 96), 0)
-    still, moved = (energy.measure(np.roll(picture, k, axis=1).clip(0, 255).astype(np.uint8)) for k in (0, 30))
+    still, moved = (energy.measure(np.roll(picture, k, axis=1).clip(0, 255).astype(np.uint8)).bands for k in (0, 30))
     np.testing.assert_allclose(moved, still, atol=0.03)  # whatever lies under where bright parts were at first

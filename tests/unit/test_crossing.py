@@ -21,7 +21,7 @@ from elpd.vision.integral import (
     rebuild_levels,
     stamp_events,
 )
-from elpd.vision.track import EventEnergy, PeakTrack
+from elpd.vision.track import EventEnergy, PeakTrack, Sharpness
 from elpd.vision.witness import Witness, frame_witness, fuse
 
 
@@ -67,7 +67,34 @@ def test_the_sharpness_that_events_keep_up_to_date_is_that_of_their_image() -> N
     image = np.zeros((50, 60), np.float32)
     np.add.at(image, (y, x), 2.0 * on - 1.0)
     expected = band_energy(image, BANDS_PX[0], np.ones_like(image), 14)
-    assert energy.measure() == pytest.approx(np.log(expected), abs=1e-4)
+    energy.measure()
+    assert energy.raw == pytest.approx(expected, rel=1e-4)
+    upon = EventEnergy(50, 60, 14, image)
+    assert energy.measure() == pytest.approx(upon.measure(), abs=1e-3)
+
+
+@pytest.mark.parametrize("noise", [0, 1, 4])
+def test_what_noise_adds_to_the_sharpness_is_taken_off(noise: int) -> None:
+    rng = np.random.default_rng(5)
+    side = 240
+    scene = cv2.GaussianBlur(rng.standard_normal((side, side)).astype(np.float32), (0, 0), 1.5)
+    energy = EventEnergy(side, side, 14, 8.0 * scene)
+    quiet = energy.measure()
+    x, y = (rng.integers(0, side, noise * side**2).astype(np.uint16) for _ in range(2))
+    energy.add(x, y, rng.integers(0, 2, x.size).astype(np.uint8))
+    assert energy.measure() == pytest.approx(quiet, abs=0.1)
+    assert (energy.raw > 1.5 * np.exp(quiet)) == (noise > 0)
+
+
+def test_a_sensor_that_sees_nothing_shows_no_rise_and_fall_of_sharpness() -> None:
+    rng = np.random.default_rng(6)
+    side, track = 120, PeakTrack()
+    energy = EventEnergy(side, side, 14)
+    for tick in range(120):
+        x, y = (rng.integers(0, side, 400).astype(np.uint16) for _ in range(2))
+        energy.add(x, y, rng.integers(0, 2, x.size).astype(np.uint8))
+        track.add(tick, float(tick), energy.measure())
+        assert not track.passed
 
 
 def test_a_band_passes_white_noise_as_its_gain_says() -> None:
@@ -202,7 +229,7 @@ def test_candidates_are_averaged_by_how_well_they_are_parabolas() -> None:
 def drawn(values: Any) -> Any:
     track = PeakTrack()
     for k, value in enumerate(values):
-        track.add_bands(1000 * k, float(k), np.full(len(BANDS_PX), float(value)))
+        track.add_sharpness(1000 * k, float(k), Sharpness(np.full(len(BANDS_PX), float(value))))
     return track
 
 
@@ -225,5 +252,5 @@ def test_a_curve_that_only_falls_or_only_rises_has_not_peaked() -> None:
 def test_a_falling_position_gives_the_same_vertex() -> None:
     track = PeakTrack()
     for k in range(60):
-        track.add_bands(1000 * k, 100.0 - k, np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0))
+        track.add_sharpness(1000 * k, 100.0 - k, Sharpness(np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0)))
     assert track.focus().at == pytest.approx(60.0)

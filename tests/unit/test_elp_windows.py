@@ -79,12 +79,13 @@ def assert_words_equal_twin(
     items, odd, _ = twin(words, width, height)
     begin = min((item[1] for item in items), default=0) + seed % 3000 - 1000
     edges = edges_from(begin, steps)
-    meter = ElpWindows(weights, inside, rate_cap=rate_cap)
+    support_us = (0, 30, 700)[seed % 3] if rate_cap else 0
+    meter = ElpWindows(weights, inside, rate_cap=rate_cap, support_us=support_us)
     if kernel is not None:
         meter._words[encoding] = kernel
     meter.extend_edges(edges)
     rows = feed_all(meter, encoding, words, cuts)
-    expected, nowhere = naive.elp_windows(items, weights, inside, edges, rate_cap=rate_cap)
+    expected, nowhere = naive.elp_windows(items, weights, inside, edges, rate_cap=rate_cap, support_us=support_us)
     assert rows == expected
     counted = {name: count for name, count in meter.counters.items() if count}
     odd = {name: count for name, count in odd.items() if count and not name.endswith("out_of_range")}
@@ -125,8 +126,10 @@ def test_long_streams_sum_by_blocks_as_word_by_word(
     inside = weights % 5 != 0
     inside[0, 0] = True
     words = evt3_stream(seed, 4000, width, height)
+    support_us = (0, 200)[seed % 2] if rate_cap else 0
+    even_us = None if open_ended else window_us
     slow, fast = (
-        ElpWindows(weights, inside, window_us=None if open_ended else window_us, rate_cap=rate_cap) for _ in range(2)
+        ElpWindows(weights, inside, window_us=even_us, rate_cap=rate_cap, support_us=support_us) for _ in range(2)
     )
     slow._words[Encoding.EVT3] = (elp_words.evt3_to_windows, elp_words.evt3_to_windows_capped)[rate_cap]
     if open_ended:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from command_line import Answer, caller
-from elpd_drivers.cameras.file import open_camera
+from elpd_drivers.cameras.file import encodings, open_camera
 from event_files import GEOMETRY, edge, many, packet
 from shared import RECORDINGS, needs_shared
 
@@ -66,8 +66,10 @@ def played(path: Path, **settings: Any) -> list[tuple[CameraPacket, list[list[in
 def test_every_format_is_played_in_packets_of_time(tmp_path: Path, word: str) -> None:
     columns = many(3000)
     edges = [edge(6000), edge(20_000, rising=False)]
-    found = played(written(tmp_path, word, [packet(columns, triggers=edges)]))
+    path = written(tmp_path, word, [packet(columns, triggers=edges)])
+    found = played(path)
     assert len(found) > 20
+    assert {one.encoding for one, _ in found} == encodings({"path": str(path)}), "said beforehand"
     assert [[t for _, part in found for t in part[k]] for k in range(4)] == [column.tolist() for column in columns]
     for (one, part), (following, _) in pairwise(found):
         if one.complete_until_us is not None:

@@ -35,14 +35,6 @@ def test_one_pass_keeps_what_it_measured() -> None:
     assert estimate.sigma_um == pytest.approx(3.0, rel=0.01)
 
 
-def test_passes_know_how_well_the_first_knew_its_lag() -> None:
-    assert passes_of(9.0, (7.0, 3.0, 1), (7.0, 5.0, -1)).lag_um() == (3.0, 0.3)
-    assert said_of.Passes().lag_um() == (0.0, float("inf"))
-    frames = said_of.Passes()
-    frames.add(said_of.Testimony((Witness("frames", 1.0, 0.5),)), 1, WHEN)
-    assert frames.lag_um() == (0.0, float("inf"))
-
-
 def test_another_lag_moves_a_witness_by_what_it_is_more() -> None:
     one = Witness("pairs", 10.0, 0.3, 2.0, freed=1.5)
     other = one.with_lag(4.0, 1.0)

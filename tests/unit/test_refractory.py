@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from elpd.vision.refractory import Refractory, refractory_period, shortest_intervals
+from elpd.vision.refractory import MOST_US, Refractory, refractory_period, shortest_intervals
 
 FOREVER = np.iinfo(np.int64).max
 
@@ -46,7 +46,7 @@ def deaf_pixels(period_us: int, grid_us: int = 1) -> tuple[NDArray[np.int64], ND
 
 
 def test_the_period_is_found_within_its_error() -> None:
-    for period_us in (0, 100, 500, 1500):
+    for period_us in (0, 100, 500, 900):
         found = refractory_period(*deaf_pixels(period_us), (40, 40))
         assert abs(found.period_us - period_us) < 3 * found.sigma_us + 2
         assert found.sigma_us < 40
@@ -67,7 +67,44 @@ def test_the_steepest_edge_in_view_is_not_taken_for_deafness() -> None:
     assert found.sigma_us == pytest.approx(shortest_us / np.sqrt(12.0), rel=0.2)
 
 
-def test_a_grid_of_time_stamps_or_few_events_tell_nothing() -> None:
-    assert refractory_period(*deaf_pixels(500, grid_us=1000), (40, 40)) == Refractory()
+def test_one_steep_edge_is_not_taken_for_deafness() -> None:
+    """It makes several intervals alike, shorter than all others, far below the crowd."""
+    random = np.random.default_rng(6)
+    waits = 600.0 + random.gamma(5.0, 150.0, (1600, 30))
+    waits[7] = 700.0 + random.normal(0.0, 10.0, 30)
+    t = np.cumsum(waits, axis=1).astype(np.int64)
+    pixel = np.repeat(np.arange(1600), 30)
+    order = np.argsort(t.ravel(), kind="stable")
+    x, y = (pixel % 40).astype(np.uint16)[order], (pixel // 40).astype(np.uint16)[order]
+    found = refractory_period(t.ravel()[order], x, y, (40, 40))
+    assert found.sigma_us > 150.0
+    assert found.period_us < 400.0
+
+
+def test_what_nobody_sets_is_not_believed() -> None:
+    assert refractory_period(*deaf_pixels(1500), (40, 40)) == Refractory(0.5 * MOST_US, MOST_US / np.sqrt(12.0))
+
+
+def test_a_grid_of_time_stamps_or_few_events_only_bound_the_period() -> None:
+    anything = Refractory(0.5 * MOST_US, MOST_US / np.sqrt(12.0))
+    assert refractory_period(*deaf_pixels(500, grid_us=1000), (40, 40)) == anything
     t, x, y = deaf_pixels(500)
-    assert refractory_period(t[:2000], x[:2000], y[:2000], (40, 40)) == Refractory()
+    few = refractory_period(t[:2000], x[:2000], y[:2000], (40, 40))
+    assert few.sigma_us > 100, "the period is anything below the shortest interval"
+    assert abs(few.period_us - 500) < 2 * few.sigma_us
+    none = np.empty(0, np.int64)
+    assert refractory_period(none, none.astype(np.uint16), none.astype(np.uint16), (40, 40)) == anything
+
+
+@pytest.mark.parametrize("grid_us", [100, 250, 1000])
+def test_intervals_as_long_as_a_grid_makes_them_are_no_period(grid_us: int) -> None:
+    """Edges in view leave intervals that crowd; on a grid the shortest ones are all alike, as if at a period."""
+    random = np.random.default_rng(8)
+    waits = 400.0 + random.gamma(4.0, 500.0, (1600, 30))
+    t = (np.cumsum(waits, axis=1) // grid_us * grid_us).astype(np.int64)
+    pixel = np.repeat(np.arange(1600), 30)
+    order = np.argsort(t.ravel(), kind="stable")
+    x, y = (pixel % 40).astype(np.uint16)[order], (pixel // 40).astype(np.uint16)[order]
+    found = refractory_period(t.ravel()[order], x, y, (40, 40))
+    assert abs(found.period_us - 400) < 2 * found.sigma_us
+    assert found.sigma_us > 100

@@ -176,3 +176,14 @@ def test_ticks_are_few_round_and_inside(low: float, width: float, count: int) ->
 )
 def test_ticks_read_well(value: float, text: str) -> None:
     assert short(value) == text
+
+
+def test_a_run_is_found_by_the_name_that_it_is_listed_by(
+    elpd: Callable[..., Answer], run: Path, tmp_path: Path
+) -> None:
+    journal = tmp_path / "journal"
+    shutil.copytree(run, journal / "of-yesterday")
+    answer = elpd("report", "of-yesterday", "--set", f"journal.directory={journal}", "--json")
+    assert answer.json["run"] == str(journal / "of-yesterday")
+    assert elpd("replay", "of-yesterday", "--set", f"journal.directory={journal}").code == 0
+    assert "`elpd runs` lists them" in elpd("report", "nothing-of-this-name").err

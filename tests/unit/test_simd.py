@@ -11,7 +11,7 @@ from elpd.events.simd import instructions
 
 HERE = Path(__file__).parent
 AVX2_ONLY = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+popcnt,+bmi,+bmi2,+lzcnt,+fma"}
-BLOCKS = [HERE / "test_events_decoders.py", HERE / "test_elp_windows.py", "-k", "by_blocks"]
+BLOCKS = [*(HERE / f"test_{one}.py" for one in ("events_decoders", "elp_windows", "latch_words")), "-k", "by_blocks"]
 
 
 @pytest.mark.skipif(instructions() != "AVX-512", reason="this processor is not one that could be either")

@@ -14,7 +14,9 @@ from openings import Opening, natural_scene, record
 from elpd.errors import FormatError, UsageError
 from elpd.records import Geometry, TemporalImage
 from elpd.units import SensorUs
-from elpd.vision.first_events import EMPTY, FirstEventMap, FirstTimes
+from elpd.vision.first_events import FirstEventMap
+from elpd.vision.first_times import FirstTimes
+from elpd.vision.latch import EMPTY
 from elpd.vision.pictures import display, read_picture, write_log_png
 from elpd.vision.temporal_map import (
     DB_PER_LOG,

@@ -15,16 +15,9 @@ from elpd.errors import UsageError
 from elpd.events.evt3_encode import Evt3Encoder
 from elpd.records import CameraPacket, Encoding, Geometry
 from elpd.units import HostNs
-from elpd.vision.first_events import (
-    EMPTY,
-    HOT,
-    SLOTS,
-    UNFIRED,
-    FirstEventMap,
-    believe,
-    latch_first_on,
-    relative_jitter,
-)
+from elpd.vision.first_events import FirstEventMap
+from elpd.vision.first_times import HOT, UNFIRED, believe, relative_jitter
+from elpd.vision.latch import EMPTY, SLOTS, latch_first_on, new_latch, stride
 
 WIDTH, HEIGHT = 7, 5
 EVENTS = st.lists(
@@ -46,17 +39,18 @@ def columns(events: list[tuple[int, int, int, int]]) -> tuple[np.ndarray, np.nda
 @given(EVENTS, st.integers(0, 40), st.integers(1, 40))
 def test_latching_equals_its_slow_twin(events: list[tuple[int, int, int, int]], begin_us: int, length_us: int) -> None:
     t, x, y, on = columns(events)
-    slots = np.full((SLOTS, HEIGHT * WIDTH), EMPTY, np.int32)
-    before, tally = np.zeros(HEIGHT * WIDTH, np.uint16), np.zeros(4, np.int64)
+    latch = new_latch(WIDTH, HEIGHT)
     latch_first_on(
-        t, x, y, on, begin_us, begin_us + length_us, WIDTH, HEIGHT, slots, before, tally, np.empty((2, 7), np.int64)
+        t, x, y, on, t.size, begin_us, begin_us + length_us, WIDTH, HEIGHT, *latch, np.empty((2, 7), np.int64)
     )
     slow_slots, slow_before, slow_tally = naive_map.latch_first_on(
         t, x, y, on, begin_us, begin_us + length_us, WIDTH, HEIGHT
     )
-    np.testing.assert_array_equal(slots.reshape(slow_slots.shape), slow_slots)
-    np.testing.assert_array_equal(before.reshape(slow_before.shape), slow_before)
-    assert tally.tolist() == slow_tally
+    slots, before = latch.slots.reshape(SLOTS, HEIGHT, -1), latch.before.reshape(HEIGHT, -1)
+    assert slots.shape[2] == stride(WIDTH)
+    np.testing.assert_array_equal(slots[:, :, :WIDTH], slow_slots)
+    np.testing.assert_array_equal(before[:, :WIDTH], slow_before)
+    assert latch.tally.tolist() == slow_tally
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.002, 0.3))

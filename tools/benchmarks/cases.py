@@ -69,8 +69,9 @@ class SweepRecording:
     """A sweep and its truth, the time in focus. Frames (n, size, size) ``uint8`` are there from ``frame_t_us`` (n,) on.
 
     ``sharpest_um`` is where the noise-free picture of this scene has its highest contrast. Off the axis that is not
-    where the PSF has its least RMS radius, which is what the paper and the tables call truth: the difference is a limit
-    to what any method that looks at pictures can reach. ``sign_limit_um`` is the statistical limit (``limit``), ``nan``
+    where the PSF has its least RMS radius, which is what the paper and the tables call truth: no method that looks at
+    pictures does better than the difference, unless it tells edges of one direction from those of another
+    (``elpd.vision.astigmatism``). ``sign_limit_um`` is the statistical limit (``limit``), ``nan``
     where it is not defined.
     """
 

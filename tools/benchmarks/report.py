@@ -89,7 +89,8 @@ focus the lens was when the answer could first be given as it stands, the median
 stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the start of the
 sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE against the place
 where the noise-free picture has its highest contrast: off the axis it is not where the spot is smallest, and a method
-that looks at pictures can hardly do better than their distance. <b>Limit</b> is the median standard deviation that the
+that looks at pictures can hardly do better than their distance, unless it tells the directions of edges apart.
+<b>Limit</b> is the median standard deviation that the
 signs of the events around focus, held against a perfect picture, would leave at best (a Cramér-Rao-like bound,
 tools/benchmarks/limit.py): a method may beat it only by using more of an event than its sign, and a bias is not in it.
 <b>CPU</b> is the median processor time of the method for the whole sweep, in this implementation.</p>

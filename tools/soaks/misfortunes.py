@@ -17,21 +17,16 @@ from elpd_drivers.sim.world import random_stream
 from elpd.service.notify import Notifier
 from elpd.service.threads import FOCUS_LIMIT_S, Supervisor
 from elpd.units import HostNs
+from soaks.stage import KilledError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from elpd.units import HostNs as Instant
-    from soaks.day import Day
+    from soaks.stage import Stage
 
 REACH_PX = 20.0
 SHAKEN_S = 5.0
-GIVEN_UP_S, GIVEN_UP_TURN_S = 30.0, 0.05
-"""A lens that nobody commands any more has come to rest by then: its controller's own dead-man, or its target."""
-
-
-class KilledError(BaseException):
-    """The process ends here, without a word: nothing may catch this."""
 
 
 class Later:
@@ -60,9 +55,9 @@ class Shaken:
         return self._motion.displacement_px(min(max(since_birth_us - self._begin_us, 0.0), self._last_us))
 
 
-def misfortunes(day: Day) -> dict[str, Callable[[], object]]:
+def misfortunes(stage: Stage) -> dict[str, Callable[[], object]]:
     """Return what may happen to *day*'s rig as it is now, by name."""
-    truth, world, engine = day.truth, day.world, day.engine
+    truth, world, engine = stage.truth, stage.world, stage.engine
     faults, board = truth.port.faults, truth.port.wire.board
 
     def camera(**how: float) -> None:
@@ -75,11 +70,11 @@ def misfortunes(day: Day) -> dict[str, Callable[[], object]]:
 
     def shake() -> None:
         light: Any = truth._light  # noqa: SLF001
-        light._motion = Shaken(int(day.chance.integers(1 << 16)), world.now_ns())  # noqa: SLF001
+        light._motion = Shaken(int(stage.chance.integers(1 << 16)), world.now_ns())  # noqa: SLF001
 
     def kill() -> None:
         if engine.place.current is None:
-            day.killed()
+            stage.killed()
             return
         faults.drop_to_board = True  # whatever unwinds after this is no part of what is tried
         raise KilledError
@@ -96,24 +91,24 @@ def misfortunes(day: Day) -> dict[str, Callable[[], object]]:
         beats.forget("focus")
 
     def damage() -> None:
-        path = day.directory / "state" / "service.json"
+        path = stage.directory / "state" / "service.json"
         if path.exists():
-            path.write_bytes(path.read_bytes()[: int(day.chance.integers(200))])
+            path.write_bytes(path.read_bytes()[: int(stage.chance.integers(200))])
 
     def fill_disk() -> None:
         """Put a file where the runs' folder was, for one cycle."""
-        runs = day.directory / "runs"
+        runs = stage.directory / "runs"
         shutil.rmtree(runs, ignore_errors=True)
         runs.touch()
         if engine.place.current is None:
-            day.wait(day.ask("focus"))
+            stage.wait(stage.ask("focus"))
             runs.unlink(missing_ok=True)
         else:
-            day.afterwards = lambda: runs.unlink(missing_ok=True)
+            stage.afterwards = lambda: runs.unlink(missing_ok=True)
 
     def reload_wrongly() -> None:
-        engine.reload(day.config("sim.board=no-such-board"))
-        day.afterwards = lambda: engine.reload(day.config())
+        engine.reload(stage.config("sim.board=no-such-board"))
+        stage.afterwards = lambda: engine.reload(stage.config())
 
     return {
         "23 scene shakes": shake,
@@ -129,6 +124,6 @@ def misfortunes(day: Day) -> dict[str, Callable[[], object]]:
         "30 state damaged": damage,
         "32 stopped for a moment": lambda: stand_still(0.7),
         "32 stopped for long": lambda: stand_still(3.0),
-        "37 reloaded": lambda: engine.reload(day.config("focus.deadline_ms=4000")),
+        "37 reloaded": lambda: engine.reload(stage.config("focus.deadline_ms=4000")),
         "37 reloaded wrongly": reload_wrongly,
     }

@@ -10,6 +10,7 @@ from elpd.events.evt2_encode import Evt2Encoder, Evt21Encoder
 from elpd.events.evt3 import Evt3Decoder
 from elpd.events.evt3_fast import Evt3BlockDecoder
 from elpd.events.simd import available
+from elpd.events.stream import PacketDecoder
 from elpd.records import CameraPacket, Encoding
 from elpd.units import HostNs
 from elpd.vision import elp_words
@@ -70,6 +71,7 @@ def ours(words: NDArray[np.uint16], n_events: int, geometry: Geometry) -> list[C
         row("elpd fused scalar, rate cap", lambda: fused(slow_capped, rate_cap=True)),
         row("elpd decode scalar", lambda: feed(Evt3Decoder(geometry), cut)),
         row("elpd first events", lambda: first_events(geometry, packets)),
+        row("elpd first events, decoded", lambda: first_events_decoded(geometry, packets)),
     ]
     return rows + translated(words[:SOME_WORDS], geometry, weights)
 
@@ -104,6 +106,17 @@ def first_events(geometry: Geometry, packets: list[CameraPacket]) -> Callable[[]
     def run() -> None:
         for packet in packets:
             first.add_packet(packet)
+
+    return run
+
+
+def first_events_decoded(geometry: Geometry, packets: list[CameraPacket]) -> Callable[[], object]:
+    """Return a run of the same in two passes: all events of a packet to arrays, then to the map."""
+    first, decoder = FirstEventMap(geometry), PacketDecoder(geometry)
+
+    def run() -> None:
+        for packet in packets:
+            first.add(*decoder.feed(packet))
 
     return run
 

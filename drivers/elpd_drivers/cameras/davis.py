@@ -78,6 +78,12 @@ class DavisSettings(CaptureSettings):
     biases: BiasTables = BiasTables()
 
 
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how packets may be encoded."""
+    del settings
+    return frozenset({Encoding.ARRAY})
+
+
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> CapturedCamera:
     """Open an iniVation camera, in a process of its own; see ``DavisSettings``.
 

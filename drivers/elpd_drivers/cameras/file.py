@@ -13,12 +13,13 @@ which closes its last windows.
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from elpd.errors import CameraError, ConfigError
+from elpd.errors import CameraError, ConfigError, FormatError
 from elpd.events.epoch import EPOCH_STEP_US
 from elpd.events.evt2 import HIGH_BITS, LOW_BITS
 from elpd.events.layout import event_columns
@@ -35,8 +36,23 @@ if TYPE_CHECKING:
     from elpd.records import Frame, ImuSample, Trigger
 
 PIECE_BYTES = 1 << 20
+PEEK_BYTES = 1 << 12
 DEFAULT_PACKET_US = 1000
 FOREVER_US = 1 << 62
+
+
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how packets may be encoded: as the recording's first is; any, where there is none to see."""
+    try:
+        reader = open_recording(Path(settings["path"]))
+    except (KeyError, FormatError):
+        return frozenset(Encoding)
+    try:
+        return frozenset(packet.encoding for packet in islice(reader.packets(PEEK_BYTES), 1)) or frozenset(Encoding)
+    except FormatError:
+        return frozenset(Encoding)
+    finally:
+        reader.close()
 
 
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> EventCamera:
@@ -86,7 +102,7 @@ class FileCamera:
         finally:
             reader.close()
         self._reader: RecordingReader | None = None
-        self._packets: Iterator[CameraPacket] = iter(())
+        self._packets: Iterator[dict[str, Any]] = iter(())
 
     @property
     def geometry(self) -> Geometry:
@@ -100,7 +116,7 @@ class FileCamera:
         self._packets = self._cut(self._reader)
         self._started_ns = self._clock.now_ns()
         self._origin_us: int | None = None
-        self._next: CameraPacket | None = None
+        self._next: dict[str, Any] | None = None
 
     def read(self, timeout_s: float) -> CameraPacket | None:
         """Wait up to *timeout_s* for the next packet's time; see ``EventCamera.read``."""
@@ -110,24 +126,15 @@ class FileCamera:
             self._next = next(self._packets, None)
             if self._next is None:
                 raise CameraError(f"the recording {self._path.name} has ended")
-        due_ns = self._due_ns(self._ends_us)
-        give_up_ns = HostNs(self._clock.now_ns() + round(timeout_s * NS_PER_S))
-        if due_ns > give_up_ns:
-            self._clock.sleep_until(give_up_ns)
-            return None
-        self._clock.sleep_until(due_ns)
-        packet, self._next = self._next, None
-        return CameraPacket(
-            data=packet.data,
-            encoding=packet.encoding,
-            received_ns=self._clock.now_ns(),
-            complete_until_us=packet.complete_until_us,
-            frames=packet.frames,
-            triggers=packet.triggers,
-            gap_before=packet.gap_before,
-            lost_events=packet.lost_events,
-            imu=packet.imu,
-        )
+        due_ns, now_ns = self._due_ns(self._ends_us), self._clock.now_ns()
+        if due_ns > now_ns:
+            give_up_ns = HostNs(now_ns + round(timeout_s * NS_PER_S))
+            self._clock.sleep_until(min(due_ns, give_up_ns))
+            if due_ns > give_up_ns:
+                return None
+            now_ns = self._clock.now_ns()
+        fields, self._next = self._next, None
+        return CameraPacket(received_ns=now_ns, **fields)
 
     def stop(self) -> None:
         """Stop playing and close the file. Idempotent."""
@@ -142,8 +149,8 @@ class FileCamera:
         assert self._origin_us is not None, "the first packet set it"
         return HostNs(self._started_ns + round((t_us - self._origin_us) * NS_PER_US / self._pace))
 
-    def _cut(self, reader: RecordingReader) -> Iterator[CameraPacket]:
-        """Yield the recording packet by packet, setting ``_ends_us`` to when each ends."""
+    def _cut(self, reader: RecordingReader) -> Iterator[dict[str, Any]]:
+        """Yield the recording packet by packet, as its fields, setting ``_ends_us`` to when each ends."""
         splitter = _Splitter()
         self._ends_us = 0
         frames: list[Frame] = []
@@ -165,33 +172,35 @@ class FileCamera:
             while True:
                 begin, position = position, splitter.split(piece, position, self._ends_us)
                 whole = position < size
-                yield CameraPacket(
-                    data=piece.data[begin:position],
-                    encoding=piece.encoding,
-                    received_ns=HostNs(0),
-                    complete_until_us=SensorUs(self._ends_us) if whole else None,
-                    frames=_take(frames, [frame.available_us for frame in frames], self._ends_us),
-                    triggers=_take(edges, [edge.t_us for edge in edges], self._ends_us) + splitter.take_triggers(),
-                    gap_before=gap,
-                    lost_events=lost,
-                    imu=_take(samples, [one.t_us for one in samples], self._ends_us),
-                )
-                gap, lost = False, 0
+                fields: dict[str, Any] = {
+                    "data": piece.data[begin:position],
+                    "encoding": piece.encoding,
+                    "complete_until_us": SensorUs(self._ends_us) if whole else None,
+                    "triggers": splitter.take_triggers(),
+                }
+                if gap or lost:
+                    fields |= {"gap_before": gap, "lost_events": lost}
+                    gap, lost = False, 0
+                if frames or edges or samples:
+                    fields |= {
+                        "frames": _take(frames, [frame.available_us for frame in frames], self._ends_us),
+                        "triggers": _take(edges, [edge.t_us for edge in edges], self._ends_us) + fields["triggers"],
+                        "imu": _take(samples, [one.t_us for one in samples], self._ends_us),
+                    }
+                yield fields
                 if not whole:
                     break
                 self._ends_us += self._packet_us
         if self._origin_us is not None:
             self._ends_us = max([self._ends_us, *(frame.available_us for frame in frames)])
-            until_us = SensorUs(self._ends_us)
-            yield CameraPacket(
-                data=piece.data[:0],
-                encoding=piece.encoding,
-                received_ns=HostNs(0),
-                complete_until_us=until_us,
-                frames=tuple(frames),
-                triggers=tuple(edges),
-                imu=tuple(samples),
-            )
+            yield {
+                "data": piece.data[:0],
+                "encoding": piece.encoding,
+                "complete_until_us": SensorUs(self._ends_us),
+                "frames": tuple(frames),
+                "triggers": tuple(edges),
+                "imu": tuple(samples),
+            }
 
 
 class _Splitter:

@@ -63,6 +63,12 @@ class MetavisionSettings(CaptureSettings):
     trigger: bool = True
 
 
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how packets may be encoded."""
+    del settings
+    return frozenset({Encoding.ARRAY})
+
+
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> CapturedCamera:
     """Open a Prophesee camera, in a process of its own; see ``MetavisionSettings``.
 

@@ -22,6 +22,7 @@ from elpd.units import SensorUs
 from elpd_drivers.cameras.capture import CapturedCamera, open_captured
 from elpd_drivers.cameras.neuromorphic_tables import (
     BUFFERS_IN_FLIGHT,
+    MODELS,
     NeuromorphicSettings,
     check_bounds,
     choose,
@@ -39,9 +40,20 @@ if TYPE_CHECKING:
 
 INSTALL = "pip install 'elpd[neuromorphic]'"
 EVENTS = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
+OF_ARRAYS = frozenset({"inivation_davis346", "inivation_dvxplorer"})
+"""Cameras that the library reads; of the others it passes on the words."""
+
 MASK_SLOTS = {"prophesee_evk4": 64, "inivation_davis346": 8}
 USB3_LATENCY_US = 150.0
 """Assumed until measured: a micro-frame of 125 us and its interrupt. ``camera.min_latency_us`` replaces it."""
+
+
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how packets of the camera that is asked for may be encoded: words or arrays, by its maker."""
+    kind = MODELS.get(settings.get("model", "auto"))
+    if kind is None:
+        return frozenset({Encoding.EVT3, Encoding.ARRAY})
+    return frozenset({Encoding.ARRAY if kind in OF_ARRAYS else Encoding.EVT3})
 
 
 def open_camera(settings: Mapping[str, Any], clock: Clock) -> CapturedCamera:
@@ -66,7 +78,7 @@ def open_source(settings: dict[str, Any]) -> NeuromorphicSource:
         device = nd.open(
             configuration,
             iterator_timeout=0.005,
-            raw=kind not in {"inivation_davis346", "inivation_dvxplorer"},
+            raw=kind not in OF_ARRAYS,
             serial=serial,
             ring_configuration=module.RingConfiguration(
                 ring_length=table.usb_packets, parallel_submissions=BUFFERS_IN_FLIGHT

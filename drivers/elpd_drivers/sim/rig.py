@@ -281,6 +281,11 @@ class SimulatedTruth:
         }
 
 
+def encodings(settings: Mapping[str, Any]) -> frozenset[Encoding]:
+    """Return how the simulated camera's packets are encoded."""
+    return frozenset({Encoding.EVT3 if settings.get("camera") == "evk4" else Encoding.ARRAY})
+
+
 def build_rig(settings: Mapping[str, Any]) -> RigParts:
     """Build a simulated rig from the table ``[sim]``; see ``SimSettings`` for the keys.
 

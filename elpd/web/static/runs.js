@@ -1,4 +1,4 @@
-// The ledger of runs: newest first, each with its curve.
+// The ledger of runs: newest first, each with its curve; above it what they say together.
 
 import { ask } from "./api.js";
 import { createChart } from "./chart.js";
@@ -6,7 +6,10 @@ import { $, facts, make, save, say, show } from "./dom.js";
 import { resultFacts } from "./focus.js";
 import { trouble } from "./notices.js";
 import { live } from "./store.js";
+import { mountTrend } from "./trend-chart.js";
 import { moment, outcomeText, prose, sigma, um } from "./words.js";
+
+const MOST_RUNS = 100;
 
 export function mountRuns(store) {
   let chart = null;
@@ -14,13 +17,15 @@ export function mountRuns(store) {
   let opened = null;
   let wasLive = false;
   let lastResult = null;
+  const trend = mountTrend(open);
 
   async function load() {
     try {
-      const { runs } = await ask("runs", { limit: 30 });
+      const { runs } = await ask("runs", { limit: MOST_RUNS });
       say($("runs-caption"), runs.length ? "newest first" : "");
       show($("no-runs"), runs.length === 0);
       $("runs").replaceChildren(...runs.map(row));
+      trend(runs);
       mark();
     } catch (error) {
       say($("runs-caption"), error.message);
