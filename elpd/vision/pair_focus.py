@@ -38,9 +38,9 @@ PAIRS_REACH = 0.8
 """How far, in widths of the curve, a pair may lie from the mode to have a say about the lag: dark pixels have lags of
 half a width in a dim room."""
 
-SOONEST = 0.05
+SOONEST = 0.02
 """Share of the pairs whose gaps are so short that they count as the next longer: what turns within microseconds is a
-pixel that fires by itself, and a few of those would outweigh the rest."""
+pixel that fires by itself; a few of those outweigh the rest, and no sensor in use has more of them than that."""
 
 PAIRS_KERNEL = 0.15
 """Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
