@@ -153,7 +153,8 @@ class SimulatedLens:
         velocity_before = self._at(at_ns - 1).velocity_at(at_ns)
         while self._stretches and self._stretches[-1].begin_ns >= at_ns:
             self._stretches.pop()
-        self._rings = [ring for ring in self._rings if ring[0] < at_ns]
+        while self._rings and self._rings[-1][0] >= at_ns:
+            self._rings.pop()
         if self._stretches:
             self._stretches[-1].end_ns = at_ns
         begin_ns, left_s = at_ns, 0.0
