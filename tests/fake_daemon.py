@@ -359,7 +359,7 @@ class InThread:
         self._thread = threading.Thread(target=self.loop.run_forever, name="fake-daemon")
         self._thread.start()
 
-    def run(self, what: Coroutine[Any, Any, Any], timeout_s: float = 20.0) -> Any:
+    def run(self, what: Coroutine[Any, Any, Any], timeout_s: float = 30.0) -> Any:
         """Run a coroutine there, and wait for what it returns."""
         return asyncio.run_coroutine_threadsafe(what, self.loop).result(timeout_s)
 
