@@ -52,8 +52,8 @@ if TYPE_CHECKING:
 UM_PER_STEP, TRAVEL_UM, BACKLASH_UM = 0.3125, 2500.0, 4.0
 SPEED_UM_S, ACCELERATION_UM_S2 = 4000.0, 400_000.0
 DEPTH_OF_FOCUS_UM = 6.0
-BOARDS_OWN_US = 200.0
-"""What boards here take over a command by themselves, about."""
+OWN_US = {"avr": 115.0, "grbl": 225.0, "scf4": 300.0, "theia": 300.0, "tic": 100.0, "tmcl": 250.0, "zaber": 300.0}
+"""What the boards here take over a command by themselves, on average."""
 SEEN_MS = (3.0, 12.0)
 """How late it is noticed that focus was passed."""
 
@@ -148,7 +148,7 @@ def made(board: str, seed: int, start_um: float, *, adapters: bool = False) -> t
     wanted = Wanted(UM_PER_STEP, TRAVEL_UM, fastest_um_s, ACCELERATION_UM_S2)
     adapter_us = 0.0
     if adapters:
-        usual_us, sigma_us = ADAPTER_LATENCY_US - BOARDS_OWN_US, ADAPTER_LATENCY_SIGMA_US
+        usual_us, sigma_us = ADAPTER_LATENCY_US - OWN_US[board], ADAPTER_LATENCY_SIGMA_US
         adapter_us = max(0.0, float(random_stream(seed, "adapter").normal(usual_us, sigma_us)))
     port, table = fitted(board, mechanism, wanted, world, seed=seed, adapter_ns=round(adapter_us * 1000))
     if adapters:

@@ -18,6 +18,7 @@ from pydantic import model_validator
 from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, state_directory
 from elpd.calibrate.quantity import Quantity
 from elpd.errors import UsageError
+from elpd.log.once import Once
 from elpd.vision.temporal_map import tabulated
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from elpd.config import Config
     from elpd.ports import Aperture
     from elpd.records import CommandStamp
+
+_once = Once()
 
 CERTAIN = 3.0
 """Standard errors that an upper bound of the opening time lies above its mean."""
@@ -177,6 +180,7 @@ def with_profile(config: Config, aperture: Aperture | None) -> Aperture | None:
     difference = stored.on.difference(measured_on(config))
     if difference is not None:
         path = path_of(directory, ApertureCalibration)
-        structlog.get_logger(__name__).warning("aperture profile not used", path=str(path), reason=difference)
+        if _once.new(str(path), difference):
+            structlog.get_logger(__name__).warning("aperture profile not used", path=str(path), reason=difference)
         return aperture
     return CalibratedAperture(aperture, stored)

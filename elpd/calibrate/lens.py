@@ -18,6 +18,7 @@ from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, save, sta
 from elpd.calibrate.quantity import Quantity
 from elpd.calibrate.stops import ModeFound, measure_stops
 from elpd.errors import ConfigError, UsageError
+from elpd.log.once import Once
 from elpd.ports import LearnsStops
 from elpd.records import StopMode
 from elpd.scale import LensScale
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from elpd.config import Config
     from elpd.ports import Lens
     from elpd.records import StopTiming
+
+_once = Once()
 
 SLOW_REPLIES_MS = 8.0
 """Half of the 16 ms that an FTDI adapter holds short replies back unless told otherwise."""
@@ -160,7 +163,8 @@ def lens_profile(config: Config, lens: Lens | None = None) -> LensCalibration | 
     difference = stored.on.difference(MeasuredOn.lens(config, lens))
     if difference is not None:
         path = path_of(directory, LensCalibration)
-        structlog.get_logger(__name__).warning("lens profile not used", path=str(path), reason=difference)
+        if _once.new(str(path), difference):
+            structlog.get_logger(__name__).warning("lens profile not used", path=str(path), reason=difference)
         return None
     return stored
 

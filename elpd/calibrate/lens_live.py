@@ -21,6 +21,7 @@ from elpd.calibrate.stops import Cruise, StopTrial
 from elpd.errors import LensError, UsageError
 from elpd.motion.braking import braking_from
 from elpd.motion.errand import REST_MS, Errands
+from elpd.ports import LearnsStops
 from elpd.records import LensFlag, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, after_ms
 
@@ -122,8 +123,11 @@ class LensBench:
         ``DeviceError`` when machinery breaks; the strongest stop has been sent.
         """
         lens = self._lens
-        if not lens.capabilities.stop_on_command:
-            raise UsageError("this lens controller cannot stop on command: there is no stop to calibrate")
+        if not (lens.capabilities.stop_on_command and isinstance(lens, LearnsStops)):
+            raise UsageError(
+                "this lens controller cannot stop on command: there is no stop to calibrate (a ruler measured with a "
+                "gauge can be given with --table)"
+            )
         try:
             homing = homing and lens.capabilities.homing
             if homing:

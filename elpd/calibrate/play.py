@@ -13,11 +13,14 @@ from pydantic import BaseModel, ConfigDict
 
 from elpd.calibrate.profile import MeasuredOn, Profile, load, path_of, state_directory
 from elpd.calibrate.quantity import Quantity  # noqa: TC001  (a model needs the types of its fields)
+from elpd.log.once import Once
 
 if TYPE_CHECKING:
     from datetime import datetime
 
     from elpd.config import Config
+
+_once = Once()
 
 SURELY_SIGMAS = 3.0
 """The final approach begins behind the target by the play and so many of its standard errors."""
@@ -74,7 +77,8 @@ def backlash_profile(config: Config) -> BacklashCalibration | None:
     difference = stored.on.difference(MeasuredOn.lens(config, ruler=True))
     if difference is not None:
         path = path_of(directory, BacklashCalibration)
-        structlog.get_logger(__name__).warning("backlash profile not used", path=str(path), reason=difference)
+        if _once.new(str(path), difference):
+            structlog.get_logger(__name__).warning("backlash profile not used", path=str(path), reason=difference)
         return None
     return stored
 

@@ -14,6 +14,7 @@ from elpd.calibrate.quantity import Quantity
 from elpd.calibrate.resting import FALSE_ALARMS, measure_rest, unmeasured
 from elpd.calibrate.thresholds import NoiseRates, measure_absolute, measure_balance
 from elpd.errors import UsageError
+from elpd.log.once import Once
 from elpd.records import SensorProfile
 from elpd.vision.refractory import refractory_period
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from elpd.config import Config
     from elpd.ports import EventCamera
     from elpd.records import Geometry
+
+_once = Once()
 
 
 class HotPixel(BaseModel):
@@ -103,7 +106,8 @@ def sensor_in_use(config: Config, camera: EventCamera) -> SensorProfile | None:
     difference = stored.on.difference(MeasuredOn.camera(config, camera))
     if difference is not None:
         path = path_of(directory, SensorCalibration)
-        structlog.get_logger(__name__).warning("sensor profile not used", path=str(path), reason=difference)
+        if _once.new(str(path), difference):
+            structlog.get_logger(__name__).warning("sensor profile not used", path=str(path), reason=difference)
         return None
     return stored.for_use()
 

@@ -14,7 +14,7 @@ dim light few pixels turn, and many of those by noise, so one pass cannot tell t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import hypot, sqrt
+from math import hypot
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,11 +85,11 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
 def _pays(first: FocusEstimate, settings: CycleSettings) -> bool:
     """Say whether the mean of two passes would have less than half the variance of a still scene's first answer.
 
-    It knows all but half the play and what pairs have of their own.
+    It knows all but half the play. What the lens has of its own is in both.
     """
-    width_um = WIDTHS_PER_DEPTH_OF_FOCUS * settings.depth_of_focus_um
-    own_um = SYSTEMATIC_PAIRS * width_um / sqrt(2.0)
-    return first.sigma_um**2 > 2.0 * (own_um**2 + (0.5 * Play.up_to(settings.backlash_um).sigma_um) ** 2)
+    optics_um = SYSTEMATIC_PAIRS * WIDTHS_PER_DEPTH_OF_FOCUS * settings.depth_of_focus_um
+    half_play_um = 0.5 * Play.up_to(settings.backlash_um).sigma_um
+    return first.sigma_um**2 - optics_um**2 > 2.0 * half_play_um**2
 
 
 def _certain(estimate: FocusEstimate | None, settings: CycleSettings) -> bool:

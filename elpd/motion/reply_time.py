@@ -85,8 +85,8 @@ class ReplyTime:
         """Return the shared delay and its standard deviation: a normal distribution, cut off at both ends."""
         if self._weight == math.inf:
             return self._supposed_s, 0.0
-        # the split is known no better than what has been seen of the scatter
-        variance = min(max(self._whole - self._chance, self._weight**-0.5), self._whole)
+        # more of the whole may be shared, by one standard deviation of what is known of the split
+        variance = min(self._whole - self._chance + self._weight**-0.5, self._whole)
         # a scatter of that standard deviation, evenly spread, reaches sqrt(3) of it below its mean
         longest_s = self._quickest_s[-1] + math.sqrt(3 * self._chance)
         return truncated(self._supposed_s, math.sqrt(variance), 0.0, longest_s)

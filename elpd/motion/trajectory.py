@@ -27,34 +27,13 @@ from elpd.errors import LensError
 from elpd.motion.commanded import REST, Motion
 from elpd.motion.epoch import FURTHER_STEPS, Epoch
 from elpd.motion.kinematics import Knot, lay_out, state_at
-from elpd.motion.reply_time import ReplyTime
+from elpd.motion.readings import Readings
 from elpd.records import LensFlag, LensReport, PositionEstimate
 from elpd.units import NS_PER_S, HostNs
 
 if TYPE_CHECKING:
     from elpd.motion.lessons import Sensitivity
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """How well a controller's times are known, all one standard deviation.
-
-    ``reply_ns`` is the usual time from the earliest possible instant of sampling to the actual one, and
-    ``reply_sigma_ns`` how well that is known for one reply; which part of it all commands and reports share, so that
-    they cannot average it away, is learnt (``reply_time``). ``quantum_steps`` is the resolution of a report in
-    motion, ``rest_quantum_steps`` at rest (0 for a controller that counts whole steps and rests on one).
-    ``ramp_steps`` is how far firmware's ramps stray from the model's while the speed changes. A reply that took longer
-    than ``prompt_ns`` was held up, nobody knows on which side of its sampling.
-    ``pace_sigma`` is by which share a motion may run faster or slower than it was told.
-    """
-
-    reply_ns: int
-    reply_sigma_ns: int
-    quantum_steps: float
-    rest_quantum_steps: float = 0.0
-    ramp_steps: float = 0.0
-    prompt_ns: int = 10_000_000
-    pace_sigma: float = 0.0
+    from elpd.motion.readings import Timing
 
 
 _MAX_REPORTS = 256
@@ -101,14 +80,15 @@ class Trajectory:
     """
 
     def __init__(self, timing: Timing, *, floor_steps: float = 0.15, history_s: float = 20.0) -> None:
-        self._timing = timing
+        self._readings = Readings(timing)
         self._floor_variance = floor_steps * floor_steps
         self._history_ns = round(history_s * NS_PER_S)
         self._epochs: list[Epoch] = []
         self._commands = 0
-        self._reply = ReplyTime(timing.reply_ns, timing.reply_sigma_ns)
-        self.held_ns = 0
-        """How long the line is known to keep replies back, after they were sampled as promptly as ever."""
+
+    def replies_are_held(self, held_ns: int) -> None:
+        """Learn how long the line keeps replies back, after they were sampled as promptly as ever."""
+        self._readings.held_ns = held_ns
 
     @property
     def known(self) -> bool:
@@ -118,12 +98,12 @@ class Trajectory:
     def begin(self, report: LensReport) -> None:
         """Forget everything and begin from *report*: at rest, or at the velocity that it tells."""
         velocity = report.velocity_sps or 0.0
-        when, _ = self._sampled(report)
+        when, _ = self._readings.sampled(report)
         epoch = Epoch(when, when, Motion(math.inf, velocity), 0.0)
-        epoch.steps, epoch.variance = report.steps, self._reading_variance(velocity, 0.0)
+        epoch.steps, epoch.variance = report.steps, self._readings.variance(velocity, 0.0)
         epoch.path = lay_out(when, report.steps, epoch.motion.pieces(report.steps, velocity))
         epoch.further = lay_out(when, report.steps + FURTHER_STEPS, epoch.motion.pieces(report.steps, velocity))
-        epoch.forget_lessons(self._timing.pace_sigma)
+        epoch.forget_lessons(self._readings.timing.pace_sigma)
         self._epochs = [epoch]
 
     def command(self, motion: Motion, effective_ns: int, sigma_ns: float) -> int:
@@ -154,11 +134,11 @@ class Trajectory:
 
     def expect(self, report: LensReport) -> Surprise:
         """Say how far *report* is from the model, without learning from it. Raises ``LensError`` before ``begin``."""
-        when, sigma_s = self._sampled(report)
+        when, sigma_s = self._readings.sampled(report)
         index = self._index(when)
         epoch = self._epochs[index]
         steps, velocity, h = epoch.depends(when)
-        reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
+        reading = self._readings.variance(self._fastest(report, velocity), sigma_s)
         variance = self._variance(epoch, velocity, h) + self._early_variance(index, when, velocity) + reading
         return Surprise(report.steps - steps, math.sqrt(variance))
 
@@ -168,9 +148,9 @@ class Trajectory:
             self.begin(report)
             return
         width_ns = report.latest_ns - report.earliest_ns
-        if width_ns > 2 * MARK_NS and self._reply.took(width_ns):
+        if width_ns > 2 * MARK_NS and self._readings.reply.took(width_ns):
             self._follow_from(1)
-        when, _ = self._sampled(report)
+        when, _ = self._readings.sampled(report)
         index = self._index(when)
         if self._not_begun(index, report):
             self._postpone(index, when)
@@ -189,10 +169,10 @@ class Trajectory:
         epoch.reports.append(report)
         self._learn_scatter(index, report)
         self._correct(index, report)
-        if report.moving and self._timing.quantum_steps and not epoch.marked:
-            times_ns = [self._sampled(one)[0] for one in epoch.reports[-PLACES:]]
+        if report.moving and self._readings.timing.quantum_steps and not epoch.marked:
+            times_ns = [self._readings.sampled(one)[0] for one in epoch.reports[-PLACES:]]
             even = [at for at in times_ns if not epoch.motion.changing_speed(state_at(epoch.path, at)[1])]
-            epoch.note_places(even, self._timing.quantum_steps)
+            epoch.note_places(even, self._readings.timing.quantum_steps)
         if self._relay(index):
             self._follow_from(index)
         elif index + 1 < len(self._epochs):
@@ -205,7 +185,7 @@ class Trajectory:
         if not epoch.marked:
             epoch.marked, epoch.reports = True, []
             self._follow_from(index)
-        half = min(MARK_NS, self._timing.reply_ns)
+        half = min(MARK_NS, self._readings.timing.reply_ns)
         self.observe(LensReport(steps, HostNs(when_ns - half), HostNs(when_ns + half), None, LensFlag.MOVING))
 
     def resume(self, report: LensReport, written_ns: int = 0) -> bool:
@@ -215,7 +195,7 @@ class Trajectory:
         write its command) ago, or will have it ``HELD_UP_NS`` from now, under this command or, for a stop that bit
         late, one before. Anything else is not believed: returns False, and nothing has changed.
         """
-        when, _ = self._sampled(report)
+        when, _ = self._readings.sampled(report)
         held_up_ns = HELD_UP_NS + written_ns
         index = self._index(when)
         present = self._epochs[index]
@@ -262,13 +242,19 @@ class Trajectory:
         It says no more than that: when the command will take effect remains as unknown as it was, but for the past.
         """
         epoch, before = self._epochs[index], self._epochs[index - 1]
-        if index == 0 or epoch.reports or epoch.anchor is not None or not epoch.delay_sigma_s or self._held_up(report):
+        if (
+            index == 0
+            or epoch.reports
+            or epoch.anchor is not None
+            or not epoch.delay_sigma_s
+            or self._readings.held_up(report)
+        ):
             return False
-        when, sigma_s = self._sampled(report)
+        when, sigma_s = self._readings.sampled(report)
         if when - epoch.nominal_ns > _UNLIKELY * epoch.delay_sigma_s * NS_PER_S:
             return False
         steps, velocity, h = before.depends(when)
-        variance = self._variance(before, velocity, h) + self._reading_variance(velocity, sigma_s)
+        variance = self._variance(before, velocity, h) + self._readings.variance(velocity, sigma_s)
         off, off_if_begun = report.steps - steps, report.steps - epoch.depends(when)[0]
         return off * off < _UNLIKELY**2 * variance and off_if_begun**2 - off * off > _CLEARLY**2 * variance
 
@@ -310,21 +296,9 @@ class Trajectory:
                 return index
         return 0
 
-    def _held_up(self, report: LensReport) -> bool:
-        """Say whether nobody knows on which side of its sampling a reply was held up."""
-        return report.latest_ns - report.earliest_ns > self._timing.prompt_ns + self.held_ns
-
-    def _sampled(self, report: LensReport) -> tuple[int, float]:
-        """Return when the report was most likely sampled, and the standard deviation of that in seconds."""
-        width = max(0, report.latest_ns - report.earliest_ns)
-        if self._held_up(report):
-            return report.earliest_ns + width // 2, width / math.sqrt(12) / NS_PER_S
-        late = min(self._reply.usual_ns, width // 2)
-        return report.earliest_ns + late, min(self._reply.chance_s, width / math.sqrt(12) / NS_PER_S)
-
     def _fastest(self, report: LensReport, velocity: float) -> float:
         """Return the velocity that a reply's time is uncertain at: a stop may lie inside a wide interval."""
-        if not self._held_up(report):
+        if not self._readings.held_up(report):
             return velocity
         ends = (report.earliest_ns, report.latest_ns)
         return max(velocity, *(state_at(self._epochs[self._index(end)].path, end)[1] for end in ends), key=abs)
@@ -347,7 +321,7 @@ class Trajectory:
             steps, velocity = epoch.anchor
             epoch.steps, epoch.variance = (
                 steps,
-                self._reading_variance(velocity, self._reply.chance_s),
+                self._readings.variance(velocity, self._readings.reply.chance_s),
             )
         epoch.path = lay_out(start, steps, motion.pieces(steps, velocity))
         further = steps + FURTHER_STEPS
@@ -358,7 +332,7 @@ class Trajectory:
             late_steps, late_velocity, _ = before.depends(late)
             epoch.later = [Knot(start, steps, velocity, 0.0)]
             epoch.later += lay_out(late, late_steps, motion.pieces(late_steps, late_velocity))
-        epoch.forget_lessons(self._timing.pace_sigma)
+        epoch.forget_lessons(self._readings.timing.pace_sigma)
         for report in epoch.reports:
             self._correct(index, report)
 
@@ -378,8 +352,8 @@ class Trajectory:
         if index + 1 < len(self._epochs):
             start = min(start, self._epochs[index + 1].start_ns)
         moved, epoch.start_ns = start - epoch.start_ns, start
-        early = [report for report in epoch.reports if self._sampled(report)[0] < start]
-        late = [report for report in before.reports if self._sampled(report)[0] >= start]
+        early = [report for report in epoch.reports if self._readings.sampled(report)[0] < start]
+        late = [report for report in before.reports if self._readings.sampled(report)[0] >= start]
         if early or late:
             epoch.reports = late + [report for report in epoch.reports if report not in early]
             before.reports = [report for report in before.reports if report not in late] + early
@@ -389,43 +363,32 @@ class Trajectory:
 
     def _correct(self, index: int, report: LensReport) -> None:
         epoch = self._epochs[index]
-        when, sigma_s = self._sampled(report)
+        when, sigma_s = self._readings.sampled(report)
         steps, velocity, h = epoch.depends(when)
-        reading = self._reading_variance(self._fastest(report, velocity), sigma_s)
+        reading = self._readings.variance(self._fastest(report, velocity), sigma_s)
         noise = reading + self._model_variance(epoch, velocity) + self._early_variance(index, when, velocity)
         epoch.lessons.correct(report.steps - steps, h, noise)
 
     def _learn_scatter(self, index: int, report: LensReport) -> None:
         """Learn how replies scatter in time, where a motion's other numbers have been learnt."""
         epoch = self._epochs[index]
-        when, _ = self._sampled(report)
+        when, _ = self._readings.sampled(report)
         steps, velocity, h = epoch.depends(when)
         if (
-            self._held_up(report)
+            self._readings.held_up(report)
             or epoch.marked
             or len(epoch.reports) <= SCATTER_FROM
             or epoch.motion.changing_speed(velocity)
         ):
             return
         others = epoch.lessons.variance(h) + self._model_variance(epoch, velocity)
-        others += self._reading_variance(velocity, 0.0) + self._early_variance(index, when, velocity)
-        self._reply.scattered(report.steps - steps, velocity, others)
+        others += self._readings.variance(velocity, 0.0) + self._early_variance(index, when, velocity)
+        self._readings.reply.scattered(report.steps - steps, velocity, others)
 
     def _variance(self, epoch: Epoch, velocity: float, h: Sensitivity) -> float:
-        common = 0.0 if epoch.marked else velocity * self._reply.common_s
-        learnt = max(epoch.lessons.variance(h), self._rounding_variance(epoch, velocity))
+        common = 0.0 if epoch.marked else velocity * self._readings.reply.common_s
+        learnt = max(epoch.lessons.variance(h), self._readings.rounding_variance(epoch, velocity))
         return learnt + common * common + self._model_variance(epoch, velocity)
-
-    def _rounding_variance(self, epoch: Epoch, velocity: float) -> float:
-        """Return what no number of reports averages away of their rounding.
-
-        Asked at regular intervals, a motor at some speeds is told with the same rounding error each time; and one that
-        was stopped on its way, with the last one for ever. Marks are not rounded, and targets are known.
-        """
-        if velocity:
-            return 0.0 if epoch.marked else self._timing.quantum_steps**2 / 12 * epoch.alike
-        stopped = epoch.motion.target_steps is None and epoch.number
-        return self._timing.rest_quantum_steps**2 / 12 if stopped else 0.0
 
     def _early_variance(self, index: int, when: int, velocity: float) -> float:
         """Return what it adds that the command after epoch *index* may have begun before its time."""
@@ -435,12 +398,8 @@ class Trajectory:
         return strays * strays
 
     def _model_variance(self, epoch: Epoch, velocity: float) -> float:
-        strays = self._timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0
+        strays = self._readings.timing.ramp_steps if epoch.motion.changing_speed(velocity) else 0.0
         return self._floor_variance + strays * strays
-
-    def _reading_variance(self, velocity: float, sigma_s: float) -> float:
-        quantum = self._timing.quantum_steps if velocity else self._timing.rest_quantum_steps
-        return quantum * quantum / 12 + (velocity * sigma_s) ** 2
 
     def _forget(self, before: int) -> None:
         while len(self._epochs) > 2 and self._epochs[1].start_ns < before:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elpd.vision.resting import hot_pixels
+from elpd.vision.resting import HOT_EVENTS, hot_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -111,8 +111,9 @@ class Evidence:
         pixel = np.concatenate([one for one, _ in self._waiting])
         sign = np.concatenate([one for _, one in self._waiting])
         self._waiting, self._waiting_events, self._bin_begun_s = [], 0, self._now_s
-        count = np.bincount(pixel, minlength=self._weights.size).reshape(self._weights.shape)
-        self._hot |= hot_pixels(count)
+        if _any_often(pixel):
+            count = np.bincount(pixel, minlength=self._weights.size).reshape(self._weights.shape)
+            self._hot |= hot_pixels(count)
         weight = np.where(self._hot.ravel()[pixel], 0.0, self._weights.ravel()[pixel])
         lost, variance = float(weight @ sign), float(weight @ weight)
         if lost**2 > STIR_SIGMAS**2 * variance:
@@ -132,3 +133,12 @@ class Evidence:
                 self._lost = max(0.0, self._lost + float(lost))
                 self._bins.clear()
                 return
+
+
+def _any_often(pixel: NDArray[Any]) -> bool:
+    """Say whether any pixel fired more often than one that is not hot may; of a scene at rest none does."""
+    fewest = int(HOT_EVENTS) + 1
+    if pixel.size < fewest:
+        return False
+    in_order = np.sort(pixel)
+    return bool((in_order[fewest - 1 :] == in_order[: 1 - fewest]).any())

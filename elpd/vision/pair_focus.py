@@ -38,6 +38,10 @@ PAIRS_REACH = 0.8
 """How far, in widths of the curve, a pair may lie from the mode to have a say about the lag: dark pixels have lags of
 half a width in a dim room."""
 
+SOONEST = 0.05
+"""Share of the pairs whose gaps are so short that they count as the next longer: what turns within microseconds is a
+pixel that fires by itself, and a few of those would outweigh the rest."""
+
 PAIRS_KERNEL = 0.15
 """Width of the kernel that finds the pairs' mode, over the way that the lens went past the peak."""
 
@@ -82,7 +86,8 @@ def pair_mode(
     sided = (pairs.on > 0) & (curvature > 0.0) if focused else (2.0 * pairs.on - 1.0) * curvature > 0.0
     believed = sided & (pairs.after >= peak - 0.5 * past)
     gap = np.maximum(pairs.after - pairs.before, 1e-3 * past)[believed]
-    weights = np.abs(curvature)[believed] / gap
+    soonest = float(np.quantile(gap, SOONEST)) if gap.size else 0.0
+    weights = np.abs(curvature)[believed] / np.maximum(gap, soonest)
     middle = pairs.middle[believed]
     mode = weighted_mode(middle, weights, PAIRS_KERNEL * past)
     if mode is None:

@@ -58,6 +58,9 @@ POINT = np.ones((1, 1), np.float32)
 CHANCE_SIGMAS = 3.0
 """What noise leaves of S, once it is subtracted, is told from nothing only beyond so many standard deviations."""
 
+APART_PX = 3
+"""The corner band of pixels so far apart has no pixel in common."""
+
 _FLOOR = 1e-12
 _GAIN = band_gain(BANDS_PX[0])
 
@@ -273,18 +276,17 @@ class EventEnergy:
 
     def measure(self) -> float:
         """Return log S now, freed of white noise as far as chance lets it be told."""
-        self.raw, corner = (_mean_square(band[self._inside]) for band in self._bands)
-        noise = min(_GAIN * corner, self.raw)
-        return float(np.log(max(self.raw - noise, self._by_chance * noise) + _FLOOR))
+        energy, corner = (np.square(band[self._inside]) for band in self._bands)
+        self.raw = float(energy.mean(dtype=np.float64))
+        noise = min(_GAIN * float(corner.mean(dtype=np.float64)), self.raw)
+        # Each pixel's noise is taken off whole; chance is in what neighbours make together. A hot pixel is alone.
+        together = _GAIN * float(np.sqrt((corner[:, :-APART_PX] * corner[:, APART_PX:]).mean(dtype=np.float64)))
+        return float(np.log(max(self.raw - noise, self._by_chance * min(noise, together)) + _FLOOR))
 
 
 def _fine(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     corner = np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)
     return [band_image(image, BANDS_PX[0]), corner]
-
-
-def _mean_square(values: NDArray[np.float32]) -> float:
-    return float(np.square(values).mean(dtype=np.float64))
 
 
 @cache

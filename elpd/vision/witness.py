@@ -82,11 +82,13 @@ class Witness:
     """What pairs that turn elsewhere add to the error: a region with several depths would have them, or motion."""
     apart: float = 0.0
     """What it is in a region that is known to be flat: how far apart halves of it put their modes."""
+    optics: float = 0.0
+    """What a lens does to one side of focus and not to the other: the same in every pass, so no mean makes it less."""
 
     @property
     def total_sigma(self) -> float:
         """All errors together."""
-        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play, self.astray]))
+        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play, self.astray, self.optics]))
 
     def on_the_way_back(self, play: float, play_sigma: float) -> Witness:
         """Return what a pass in the opposite direction said, on the ruler of the sweep.
@@ -152,11 +154,18 @@ class EventWitnesses:
             held = SYSTEMATIC_IMAGE * dull
             found.append(Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at))
         if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
-            parts = [self.pairs.sigma, SYSTEMATIC_PAIRS * width, PAIRS_DEPART * departure]
-            sigma, astray = float(np.linalg.norm(parts)), stray * width
-            apart = 0.0 if self.turns is None else halves_apart(self.turns)
-            pairs = Witness("pairs", self.pairs.at, sigma, shared, freed=self.pairs_lag, astray=astray, apart=apart)
-            found.append(pairs)
+            found.append(
+                Witness(
+                    "pairs",
+                    self.pairs.at,
+                    float(np.hypot(self.pairs.sigma, PAIRS_DEPART * departure)),
+                    shared,
+                    freed=self.pairs_lag,
+                    astray=stray * width,
+                    apart=0.0 if self.turns is None else halves_apart(self.turns),
+                    optics=SYSTEMATIC_PAIRS * width,
+                )
+            )
         return found
 
 
@@ -189,7 +198,7 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     if not witnesses:
         return None
     at = np.array([one.at for one in witnesses])
-    common = np.array([(one.shared, one.held, one.play) for one in witnesses])
+    common = np.array([(one.shared, one.held, one.play, one.optics) for one in witnesses])
     covariance = np.diag([one.sigma**2 + one.astray**2 for one in witnesses]) + common @ common.T
     precision = np.linalg.inv(covariance)
     share = precision.sum(axis=0) / precision.sum()

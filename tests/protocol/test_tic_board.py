@@ -272,6 +272,20 @@ def test_a_host_that_falls_silent_is_outlived_by_a_second_at_most() -> None:
     assert made.rotor < 3200 + 1300
 
 
+@pytest.mark.parametrize("gap_ms", [0.0, 1.0, 3.0, 20.0])
+def test_after_a_long_silence_it_moves_though_a_reply_still_tells_of_the_timeout(gap_ms: float) -> None:
+    """As where a camera took five seconds to open: what was asked before the errors were cleared arrives after."""
+    made = rig("tic")
+    lens = made.open()
+    made.live(100)
+    made.clock.pass_ms(1500)
+    made.poll()
+    made.clock.pass_ms(gap_ms)
+    lens.move_to(3500, 3000.0)
+    made.live(600)
+    assert made.rotor == 3500
+
+
 def test_it_homes_faster_than_the_lens_may_sweep() -> None:
     made = rig("tic")
     made.open(max_speed_um_s=100.0)  # the board homes at its own settings' speed, which is higher

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from command_line import Answer, caller
 from lens_rigs import KINDS, SPEED_SPS, UM_PER_STEP, Rig, open_rig, rig
+from structlog.testing import capture_logs
 
 from elpd import rig as rigs
 from elpd.calibrate.in_use import as_measured
-from elpd.calibrate.lens import Stopping, measure_lens, teach, with_part
+from elpd.calibrate.lens import Stopping, lens_profile, measure_lens, teach, with_part
 from elpd.calibrate.lens import keep as keep_profile
 from elpd.calibrate.lens_live import LensBench, lost_steps
 from elpd.calibrate.profile import MeasuredOn
@@ -179,6 +180,24 @@ def test_a_lens_without_a_reference_or_without_room_is_refused() -> None:
 
 def stopping_of(kind: str) -> Stopping:
     return measure_lens(bench(open_rig(kind)).measure(homing=False))
+
+
+def test_a_profile_of_another_lens_is_told_once(tmp_path: Path) -> None:
+    grbl = ("sim.board=grbl", f"state.directory={tmp_path}")
+    config = load(None, grbl)
+    keep_profile(config, with_part(config, MeasuredOn.lens(config), stopping=stopping_of("grbl")))
+    other = load(None, (*grbl, "sim.backlash_um=5.0"))
+    with capture_logs() as logs:
+        for _ in range(3):
+            assert lens_profile(other) is None
+            assert as_measured(other) is other
+    assert [log["event"] for log in logs] == ["lens profile not used"]
+
+
+def test_a_lens_that_cannot_be_stopped_has_no_stop_to_calibrate() -> None:
+    theia = load(None, ["sim.board=theia", "state.profiles=false"])
+    with rigs.lens_alone(theia) as (clock, lens, scale), pytest.raises(UsageError, match="no stop to calibrate"):
+        LensBench(clock, lens, scale, speed_um_s=1000.0, repeats=2).measure(homing=False)
 
 
 def test_a_profile_teaches_its_own_lens_and_no_other(tmp_path: Path) -> None:

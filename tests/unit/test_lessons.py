@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from elpd.motion.commanded import Motion
 from elpd.motion.lessons import Lessons, Sensitivity
-from elpd.motion.trajectory import HELD_UP_NS, Timing, Trajectory
+from elpd.motion.readings import Timing
+from elpd.motion.trajectory import HELD_UP_NS, Trajectory
 from elpd.records import LensFlag, LensReport
 from elpd.units import HostNs
 

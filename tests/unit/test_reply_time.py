@@ -26,10 +26,10 @@ def after_replies(scatter_s: float, count: int, sigma_ns: float = 100_000.0) -> 
     return learnt
 
 
-def test_before_any_reply_half_of_the_variance_is_shared() -> None:
+def test_before_any_reply_half_of_the_variance_is_chance_and_more_than_half_may_be_shared() -> None:
     supposed = ReplyTime(300_000, 100_000)
     assert supposed.chance_s == pytest.approx(100e-6 / 2**0.5)
-    assert supposed.common_s == pytest.approx(100e-6 / 2**0.5, rel=0.01)
+    assert supposed.common_s == pytest.approx(100e-6 * (0.5 + 0.5 * 0.5**0.5) ** 0.5, rel=0.01)
     assert supposed.usual_ns == 300_000
 
 
@@ -73,8 +73,9 @@ def test_the_shared_delay_is_a_normal_one_cut_off(quickest_us: float, usual_us: 
     learnt = ReplyTime(usual_us * 1000, sigma_us * 1000)
     for _ in range(3):
         learnt.took(quickest_us * 1000)
-    shared_us = sigma_us / 2**0.5
-    times_us = np.linspace(0.0, quickest_us + 3**0.5 * shared_us, 20_001)  # the slow twin: a sum
+    chance_us = sigma_us / 2**0.5
+    shared_us = sigma_us * (0.5 + 0.5 * 0.5**0.5) ** 0.5
+    times_us = np.linspace(0.0, quickest_us + 3**0.5 * chance_us, 20_001)  # the slow twin: a sum
     weight = np.exp(-0.5 * ((times_us - usual_us) / shared_us) ** 2)
     if weight.sum() * (times_us[1] - times_us[0]) < 1e-4 * shared_us:
         return  # supposed far outside of what was seen: the bounds alone are left

@@ -45,6 +45,16 @@ def test_a_halt_ends_on_a_whole_step() -> None:
     assert 0 <= rest - lens.pulses_at(round(50.0333 * MS)) <= 1
 
 
+@pytest.mark.parametrize("us", [0, 1, 30, 200, 800, 3000])
+def test_a_motor_that_has_just_set_out_is_at_rest_at_once_when_it_is_halted(us: int) -> None:
+    lens = SimulatedLens(QUIET, start_um=1000.0)
+    lens.set_velocity(0, V, A)
+    lens.halt(us * 1000)
+    assert lens.velocity_at(us * 1000 + 2 * MS) == 0.0
+    assert lens.pulses_at(us * 1000 + 2 * MS) % 1.0 == pytest.approx(0.0, abs=1e-6)
+    assert 0.0 <= lens.pulses_at(100 * MS) - 3200.0 <= lens.pulses_at(us * 1000) - 3200.0 + 1.0
+
+
 def test_backlash_is_a_play_that_must_be_crossed() -> None:
     lens = SimulatedLens(QUIET, start_um=1000.0)
     lens.move_to(0, 3264, V, A)

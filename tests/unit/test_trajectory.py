@@ -15,7 +15,8 @@ from lens_rigs import KINDS, SPEED_SPS, UM_PER_STEP, needs, rig
 from elpd.errors import LensError
 from elpd.motion.commanded import REST, Motion
 from elpd.motion.kinematics import Piece, approach, in_segments, lay_out, ramp, state_at
-from elpd.motion.trajectory import Timing, Trajectory
+from elpd.motion.readings import Timing
+from elpd.motion.trajectory import Trajectory
 from elpd.records import LensFlag, LensReport, StopMode
 from elpd.units import HostNs
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, LensError
 from elpd.motion.commanded import Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import LensCapabilities, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, after_ms
 from elpd_drivers.lenses import avr_wire as wire

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
 from elpd.motion.commanded import REST, Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses.asking import Asking

@@ -17,7 +17,7 @@ from elpd_drivers.lenses.line import Trouble
 
 if TYPE_CHECKING:
     from elpd.motion.commanded import Motion
-    from elpd.motion.trajectory import Timing
+    from elpd.motion.readings import Timing
     from elpd.records import PositionEstimate
 
 CONFIRMATIONS = 3
@@ -147,7 +147,7 @@ class Motor:
     def replies_are_held(self, held_ns: int) -> None:
         """Learn how long the line keeps replies back: so much of a report's interval says nothing of its sampling."""
         with self._lock:
-            self._trajectory.held_ns = held_ns
+            self._trajectory.replies_are_held(held_ns)
 
     def begin(self, report: LensReport) -> None:
         """Forget what was modelled and begin from *report*."""

@@ -20,7 +20,7 @@ import structlog
 
 from elpd.errors import ConfigError, LensError
 from elpd.motion.commanded import Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import scf4_wire as wire

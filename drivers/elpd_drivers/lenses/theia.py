@@ -24,7 +24,7 @@ import structlog
 
 from elpd.errors import LensError, UsageError
 from elpd.motion.commanded import Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import CommandStamp, LensCapabilities, LensFlag, LensLimits, LensReport, StopMode
 from elpd.units import NS_PER_MS, NS_PER_S, NS_PER_US, HostNs, Steps, after_ms
 from elpd_drivers.lenses import theia_wire as wire

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import LensError
 from elpd.motion.commanded import Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import LensCapabilities, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import tic_wire as wire
@@ -112,6 +112,7 @@ class TicController:
         self._sampled_from_ns = 0
         self._newest = wire.TicReply(0, 0.0, 0, 0)
         self._status = self._errors = 0
+        self._cleared_ns = 0
         self._halted_softly = False
         self._told_home_ns: int | None = None
         self._newest_from_ns = 0
@@ -240,8 +241,8 @@ class TicController:
         report = self._motor.report
         idle = report is None or self._clock.now_ns() - report.latest_ns > 200 * NS_PER_MS
         if self._errors or idle:
-            self._line.send(self._frame(wire.ENERGIZE) + self._frame(wire.EXIT_SAFE_START))
-            self._errors = 0
+            sent = self._line.send(self._frame(wire.ENERGIZE) + self._frame(wire.EXIT_SAFE_START))
+            self._errors, self._cleared_ns = 0, sent.off_wire_ns
 
     # --- homing ----------------------------------------------------------------------------------------------------
 
@@ -352,7 +353,8 @@ class TicController:
     def _watch_errors(self, report: LensReport) -> None:
         """Stop for what a person must look at; an idle Tic's timeout is cleared before the next motion."""
         errors, due = self._errors, self._motor.rest_due_ns
-        under_way = due is not None and report.latest_ns < due
+        # A reply that was asked for before an idle Tic's errors were cleared may arrive after: it tells of those.
+        under_way = due is not None and self._cleared_ns < report.earliest_ns and report.latest_ns < due
         serious = errors & ~wire.RECOVERABLE
         if serious or (errors and under_way and not report.moving):
             words = ", ".join(word for bit, word in wire.ERROR_WORDS.items() if errors & bit)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from elpd.errors import ConfigError, LensError
 from elpd.motion.commanded import Motion
-from elpd.motion.trajectory import Timing
+from elpd.motion.readings import Timing
 from elpd.records import LensCapabilities, LensLimits, StopMode
 from elpd.units import NS_PER_MS, after_ms
 from elpd_drivers.lenses import tmcl_wire as wire

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 STEPS_PER_ELECTRICAL_CYCLE = 4 * 64
 
+LAST_STEP_S = 1e-3
+"""A halted motor is at rest within this time: the last step before it takes a tenth of it in a sweep."""
+
 
 @dataclass(frozen=True, slots=True)
 class LensMechanics:
@@ -125,13 +128,19 @@ class SimulatedLens:
         self.follow(at_ns, approach(self.pulses_at(at_ns), velocity, target_steps, speed_sps, acceleration_sps2))
 
     def halt(self, at_ns: int) -> None:
-        """Stop without a ramp, on the next whole step: a controller never rests between two steps."""
+        """Stop without a ramp, on the next whole step: a controller never rests between two steps.
+
+        One that has only just set out, or has nearly arrived, is so slow that the next step would be long in coming:
+        it rests on the nearest.
+        """
         steps, velocity = self.pulses_at(at_ns), self.velocity_at(at_ns)
         if velocity == 0.0:
             self.follow(at_ns, ramp(0.0, 0.0, 1.0))
             return
         rest = math.ceil(steps - 1e-6) if velocity > 0 else math.floor(steps + 1e-6)
-        last_s = (rest - steps) / velocity if abs(velocity) > 1.0 else 0.0
+        last_s = (rest - steps) / velocity
+        if last_s > LAST_STEP_S:
+            last_s, velocity = LAST_STEP_S, (round(steps) - steps) / LAST_STEP_S
         self.follow(at_ns, (Piece(max(last_s, 0.0), velocity, 0.0), Piece(math.inf, 0.0, 0.0)))
 
     def follow(self, at_ns: int, pieces: Iterable[Piece]) -> None:
@@ -144,7 +153,8 @@ class SimulatedLens:
         velocity_before = self._at(at_ns - 1).velocity_at(at_ns)
         while self._stretches and self._stretches[-1].begin_ns >= at_ns:
             self._stretches.pop()
-        self._rings = [ring for ring in self._rings if ring[0] < at_ns]
+        while self._rings and self._rings[-1][0] >= at_ns:
+            self._rings.pop()
         if self._stretches:
             self._stretches[-1].end_ns = at_ns
         begin_ns, left_s = at_ns, 0.0
