@@ -92,6 +92,7 @@ class BandFocus:
     ``scatter`` is how far the points of the two finest bands lie off their parabolas, as an error of the vertex.
     ``as_blur`` says that the finest band rose higher than the next and has the narrower top: blur takes fine structure
     first. The difference of two pictures that lie aside comes and goes in all bands alike, or in coarse ones first.
+    ``directed`` is the part of the error that comes of the directions of edges, which is no scatter.
     """
 
     at: float
@@ -101,6 +102,7 @@ class BandFocus:
     scatter: float
     as_blur: bool = True
     astigmatism: Astigmatism | None = field(default=None, compare=False)
+    directed: float = 0.0
 
     def mirrored(self, sign: float) -> BandFocus:
         """Return the same on a ruler that runs the other way, where *sign* is -1."""
@@ -160,7 +162,7 @@ def focus_of_bands(
     own = float(np.sqrt(inverse[0, 0] * max(1.0, squares / count)))
     # The bands share the error of what was taken off.
     sigma = float(np.linalg.norm([own, UNEXPLAINED * departure, shifts[0][1]]))
-    return BandFocus(focus, sigma, finest, departure, scatter, as_blur, tilt)
+    return BandFocus(focus, sigma, finest, departure, scatter, as_blur, tilt, shifts[0][1])
 
 
 def average_focus(candidates: Sequence[BandFocus]) -> BandFocus:

@@ -177,7 +177,8 @@ def stray_share(pairs: Mode | None) -> float:
 def frame_witness(vertex: BandFocus, spacing: float) -> Witness:
     """Return what frames say, taken every *spacing* along the sweep."""
     coarseness = max(1.0, spacing / (COARSE_FRAMES * vertex.finest.width))
-    return Witness("frames", vertex.at, coarseness * vertex.sigma)
+    own = float(np.sqrt(max(0.0, vertex.sigma**2 - vertex.directed**2)))
+    return Witness("frames", vertex.at, float(np.hypot(coarseness * own, vertex.directed)))
 
 
 def lamp_witness(vertex: Vertex, width: float, spacing: float) -> Witness:

@@ -1,5 +1,6 @@
 """The rebuilt image against its twin, the vertex, and how witnesses are fused."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -180,6 +181,8 @@ def test_images_of_a_scene_that_moved_lie_beside_each_other() -> None:
 def test_frames_far_apart_are_trusted_less() -> None:
     focus = BandFocus(0.0, 0.5, Vertex(0.0, 0.5, 80.0, 5), 0.0, 0.1)
     assert frame_witness(focus, 80.0).sigma > 3.0 * frame_witness(focus, 16.0).sigma
+    directed = replace(focus, directed=focus.sigma)
+    assert frame_witness(directed, 80.0).sigma == pytest.approx(focus.sigma), "few frames do not turn a lens's edges"
 
 
 def test_white_noise_has_no_energy_in_any_band() -> None:
