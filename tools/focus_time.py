@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from elpd.ports import Clock
     from elpd.records import CameraPacket, ElpSample, FocusEstimate
 
-PHASES = ("sweep", "stop", "return", "verify")
+PHASES = ("sweep", "stop", "recross", "return", "verify")
 
 
 class Nowhere:
@@ -128,8 +128,9 @@ def focus(config: Config, seed: int, *, charge: bool) -> dict[str, Any]:
         rig.release(parts)
     took = {phase.name: phase.ms for phase in result.phases}
     row: dict[str, Any] = {"seed": seed, "scene": getattr(parts.truth, "scene", ""), "outcome": result.outcome.value}
-    row |= {f"{name}_ms": took.get(name) for name in PHASES}
+    row |= {f"{name}_ms": took.get(name, 0.0) for name in PHASES}
     row["total_ms"] = sum(took.get(name, 0.0) for name in PHASES)
+    row["reason"] = result.reason
     row |= {f"cpu_{name}_ms": Meter.spent_ms.get(name, 0.0) for name in ("watch", "estimate")}
     return row | {"overshoot_um": _beyond(truth.get("stop_error_um"), up=up), "final_error_um": truth["final_error_um"]}
 
@@ -142,7 +143,7 @@ def line(row: dict[str, Any]) -> str:
     """Return one cycle as a line."""
     head = f"seed {row['seed']:4d} {row['scene']:10s} {row['outcome']:15s}"
     if row["outcome"] != "FOCUSED":
-        return head
+        return f"{head} {row['reason']}"
     phases = "  ".join(f"{name} {row[f'{name}_ms']:5.1f}" for name in PHASES)
     return (
         f"{head} {row['total_ms']:6.1f} ms ({phases})  beyond focus {row['overshoot_um']:5.1f} um, at rest "

@@ -192,7 +192,7 @@ class FocusCycle:
         self._stop_um, self._stop_latency_us = ended.um, ended.latency_us
         first, furthest_um = watch.after.estimate(), ended.um
         if recross.is_needed(watch, first, self._settings):
-            first, furthest_um = self._pass_again(watch, first, sign)
+            first, furthest_um = self._pass_again(watch, first, sign, furthest_um)
             way = WayBack(self._stage, self._settings, sign, self._settings.speed_um_s)
         estimate = self._judge(watch, first, sign, (passed.begun_um, furthest_um))
         self._phase(Phase.RETURN)
@@ -284,12 +284,14 @@ class FocusCycle:
             self._reversals = search.reversals
             self._details["strategy"], self._details["sweep_sign"] = search.strategy, search.sign
 
-    def _pass_again(self, watch: Watch, first: FocusEstimate | None, sign: int) -> tuple[FocusEstimate | None, float]:
+    def _pass_again(
+        self, watch: Watch, first: FocusEstimate | None, sign: int, furthest_um: float
+    ) -> tuple[FocusEstimate | None, float]:
         """Go over focus again; return what all passes say and the furthest place."""
         self._phase(Phase.RECROSS)
         if first is not None:
             self._sink.note("one pass", focus_um=first.focus_um, sigma_um=first.sigma_um)
-        return recross.pass_again(self._stage, watch, self._settings, first, sign, self._deadline_ns)
+        return recross.pass_again(self._stage, watch, self._settings, first, sign, self._deadline_ns, furthest_um)
 
     def _judge(
         self, watch: Watch, estimate: FocusEstimate | None, sign: int, way_um: tuple[float, float]

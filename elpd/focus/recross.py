@@ -104,10 +104,12 @@ def pass_again(
     first: FocusEstimate | None,
     sign: int,
     deadline_ns: HostNs,
+    furthest_um: float,
 ) -> tuple[FocusEstimate | None, float]:
     """Go over focus again until it is known or there is no more time: back, and then there and back.
 
-    Returns what all passes say and the furthest place, um, in the sweep's direction. In a still scene a doubtful answer
+    Returns what all passes say and the furthest place, um, in the sweep's direction; *furthest_um* is how far the sweep
+    went, from where the lens may be on its way back by now. In a still scene a doubtful answer
     may come of several depths; more passes would only make their mixture look certain. So they are believed only if
     they tell that the region is flat (``vision.relief``), or if one of them has seen the scene move, which a hand that
     turned round in the first did not show; else the answer stays as it was.
@@ -117,7 +119,6 @@ def pass_again(
     """
     answer = estimate = first
     past_um = 0.0 if watch.scene_moves else watch.after.past_um
-    furthest_um = stage.here_um()
     for looks, ways in enumerate([(-sign,), *MOST_ROUNDS * [(sign, -sign)]]):
         begun_ns = stage.now_ns()
         about_um = watch.after.peak_um if estimate is None else estimate.focus_um

@@ -152,10 +152,19 @@ def edges_of(image: NDArray[np.float32], weight: NDArray[np.float32], margin: in
     margin
         Pixels at each side that do not count.
     """
-    inside = inside_margin(image.shape, margin)
-    seen = np.zeros(image.shape, np.float32)
+    return edges_of_each([image], weight, margin)[0]
+
+
+def edges_of_each(images: Sequence[NDArray[np.float32]], weight: NDArray[np.float32], margin: int = 0) -> list[Edges]:
+    """Return the same of images whose pixels have the same say."""
+    inside = inside_margin(weight.shape, margin)
+    seen = np.zeros(weight.shape, np.float32)
     seen[inside] = weight[inside]
     fading = np.sqrt(np.maximum(cv2.GaussianBlur(seen, (0, 0), TAPER_PX), 0.0))
+    return [_edges(image, fading) for image in images]
+
+
+def _edges(image: NDArray[np.float32], fading: NDArray[np.float32]) -> Edges:
     fine = image - cv2.GaussianBlur(image, (0, 0), _COARSEST_PX)
     power = np.square(np.abs(np.fft.rfft2(fine * fading))).ravel()
     polar = _polar(*image.shape)

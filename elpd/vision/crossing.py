@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from elpd.vision.astigmatism import edges_of
+from elpd.vision.astigmatism import edges_of_each
 from elpd.vision.bands import BandFocus, average_focus
 from elpd.vision.drift import LOOKS, Drift, find_drift
 from elpd.vision.image_focus import band_energy_image, image_focus, sharpness_curves, typical_slowness, who_turns
@@ -202,7 +202,7 @@ def _sharpest(
     # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
     # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
     below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
-    edges = [edges_of(image, light.weight, events.margin) for image in images]
+    edges = edges_of_each(images, light.weight, events.margin)
     bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(light.worths) * [below]]
     curves = quiet if still else loud if drift.seen else loud + quiet
     candidates = [

@@ -144,8 +144,9 @@ def stamp_grid_us(t_us: NDArray[np.int64]) -> int:
     Some may lie between: simulators share out what is too much for one step. Stamps of a fine clock are as far apart as
     events are scarce, and of so few none would show a faster line.
     """
-    stamps = np.unique(t_us)
-    return max(1, int(np.median(np.diff(stamps)))) if stamps.size > 1 else 1
+    intervals = np.diff(np.sort(t_us, kind="stable"))
+    intervals = intervals[intervals > 0]
+    return max(1, int(np.median(intervals))) if intervals.size else 1
 
 
 def _recurs(
