@@ -22,7 +22,7 @@ import numpy as np
 from elpd.vision.integral import BANDS_PX, fit_vertex, inside_margin, with_window
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -155,7 +155,7 @@ def edges_of(image: NDArray[np.float32], weight: NDArray[np.float32], margin: in
     return edges_of_each([image], weight, margin)[0]
 
 
-def edges_of_each(images: Sequence[NDArray[np.float32]], weight: NDArray[np.float32], margin: int = 0) -> list[Edges]:
+def edges_of_each(images: Iterable[NDArray[np.float32]], weight: NDArray[np.float32], margin: int = 0) -> list[Edges]:
     """Return the same of images whose pixels have the same say."""
     inside = inside_margin(weight.shape, margin)
     seen = np.zeros(weight.shape, np.float32)

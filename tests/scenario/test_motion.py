@@ -66,7 +66,8 @@ def test_a_doubtful_answer_is_looked_at_again_and_a_scene_that_lies_elsewhere_th
 
 
 def test_where_one_pass_is_enough_no_second_is_made() -> None:
-    story = shown("static", 1)
+    story = play("sim.camera=evk4", "sim.seed=1", "sim.start_um=-200")
+    assert_invariants(story)
     assert story.outcome is Outcome.FOCUSED
     assert "recross" not in story.phases
     assert story.result is not None
