@@ -45,7 +45,7 @@ PLACES = 64
 """Of so many of a motion's newest reports it is seen whether they were rounded alike."""
 SCATTER_FROM = 3
 """After so many reports of a motion the next one's surprise tells of its time."""
-_CLEARLY = 2.0
+_CLEARLY = 1.0
 """By so many standard deviations one motion must explain a report better than another to be taken for it."""
 _UNLIKELY = 3.0
 """Standard deviations beyond which a report at rest shows that the model's own are too small."""

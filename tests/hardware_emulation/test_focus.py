@@ -123,7 +123,7 @@ def test_trigger_words_in_the_stream_reach_the_lens_as_position_marks(usb: Usb, 
     session = focus_on(parts, config, FocusRequest(roi=REGION))
     assert session.result.outcome is Outcome.FOCUSED
     assert not any("trigger input" in warning for warning in session.result.warnings)
-    assert worst_at_speed(parts) < UNMARKED_STEPS / 10
+    assert worst_at_speed(parts, session.result) < UNMARKED_STEPS / 10
     assert usb.evk4.listening
     assert session.run is not None
     marks = [line for line in (session.run / "tape.jsonl").read_text().splitlines() if '"call":"lens.mark"' in line]

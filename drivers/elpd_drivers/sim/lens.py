@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 STEPS_PER_ELECTRICAL_CYCLE = 4 * 64
 
-LAST_STEP_S = 1e-3
-"""A halted motor is at rest within this time: the last step before it takes a tenth of it in a sweep."""
+LAST_STEP_S = 4e-3
+"""A halted motor is at rest within this time: at 250 steps/s and more it takes the step under way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class SimulatedLens:
         """Stop without a ramp, on the next whole step: a controller never rests between two steps.
 
         One that has only just set out, or has nearly arrived, is so slow that the next step would be long in coming:
-        it rests on the nearest.
+        it rests on the nearest, of two as near on the one ahead.
         """
         steps, velocity = self.pulses_at(at_ns), self.velocity_at(at_ns)
         if velocity == 0.0:
@@ -140,7 +140,8 @@ class SimulatedLens:
         rest = math.ceil(steps - 1e-6) if velocity > 0 else math.floor(steps + 1e-6)
         last_s = (rest - steps) / velocity
         if last_s > LAST_STEP_S:
-            last_s, velocity = LAST_STEP_S, (round(steps) - steps) / LAST_STEP_S
+            nearest = math.floor(steps + 0.5 + 1e-6) if velocity > 0 else math.ceil(steps - 0.5 - 1e-6)
+            last_s, velocity = LAST_STEP_S, (nearest - steps) / LAST_STEP_S
         self.follow(at_ns, (Piece(max(last_s, 0.0), velocity, 0.0), Piece(math.inf, 0.0, 0.0)))
 
     def follow(self, at_ns: int, pieces: Iterable[Piece]) -> None:
