@@ -194,6 +194,8 @@ class Hearing:
         """
         hot, sensor, support_us = self.resting.hot, self._sensor, self._support_us
         self.memory = EventMemory(self.roi, self._geometry, hot=hot, sensor=sensor, start=start, support_us=support_us)
+        if self.lamp is not None:
+            self.memory.under_a_lamp()
 
     def _net(self, sample: ElpSample) -> ElpSample:
         if self.lamp is None:

@@ -119,6 +119,10 @@ class EventMemory:
         """Where planes of the region are in focus, nearest first along the sweep, if ``witnesses`` found several."""
         self._least_energy = LEAST_LEVEL * band_gain(BANDS_PX[0])
 
+    def under_a_lamp(self) -> None:
+        """Expect net events of whole lamp periods, whose chance is not white."""
+        self._energy.white = False
+
     def add(self, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Keep those of the events (in time order, in the sensor's coordinates) that matter. They are copied."""
         inside = (x >= self._left) & (x < self._right) & (y >= self._top) & (y < self._bottom)

@@ -267,6 +267,8 @@ class EventEnergy:
         self._by_chance = CHANCE_SIGMAS * float(np.sqrt(2.0 * _freed_patch() / pixels))
         self.raw = 0.0
         """S at the last look, with its noise."""
+        self.white = True
+        """Whether what is noise is white: what whole periods of a lamp leave behind is not."""
 
     def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], on: NDArray[np.uint8]) -> None:
         """Take events, in coordinates of the image."""
@@ -278,6 +280,8 @@ class EventEnergy:
         """Return log S now, freed of white noise as far as chance lets it be told."""
         energy, corner = (np.square(band[self._inside]) for band in self._bands)
         self.raw = float(energy.mean(dtype=np.float64))
+        if not self.white:
+            return float(np.log(self.raw + _FLOOR))
         noise = min(_GAIN * float(corner.mean(dtype=np.float64)), self.raw)
         # Each pixel's noise is taken off whole; chance is in what neighbours make together. A hot pixel is alone.
         together = _GAIN * float(np.sqrt((corner[:, :-APART_PX] * corner[:, APART_PX:]).mean(dtype=np.float64)))

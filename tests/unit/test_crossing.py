@@ -98,6 +98,18 @@ def test_a_sensor_that_sees_nothing_shows_no_rise_and_fall_of_sharpness() -> Non
         assert not track.passed
 
 
+def test_what_whole_lamp_periods_leave_behind_is_not_taken_for_white_noise() -> None:
+    rng = np.random.default_rng(6)
+    x, y = (rng.integers(0, 120, 4000).astype(np.uint16) for _ in range(2))
+    on = rng.integers(0, 2, x.size).astype(np.uint8)
+    freed, whole = EventEnergy(120, 120, 14), EventEnergy(120, 120, 14)
+    whole.white = False
+    for energy in (freed, whole):
+        energy.add(x, y, on)
+    assert whole.measure() == pytest.approx(np.log(whole.raw), abs=1e-6)
+    assert freed.measure() < whole.measure() - 1.0
+
+
 def test_a_band_passes_white_noise_as_its_gain_says() -> None:
     noise = np.random.default_rng(4).standard_normal((400, 400)).astype(np.float32)
     for scale_px in BANDS_PX:
