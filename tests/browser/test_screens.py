@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from gestures import begin_sweep, expect, sensor_to_page
+from gestures import REFUSED, begin_sweep, expect, sensor_to_page
 from probes import FOCUSED, MOVING, PALE, TOUCHES
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ def test_text_can_be_read_in_both_schemes(opened: Opener, rig: Rig, scheme: str)
     for notice in ("#fault", "#held", "#warnings"):
         expect(page.locator(notice)).to_be_visible()
     assert page.evaluate(PALE) == {}
+    opened.expected = (REFUSED,)
     rig.stop()
     expect(page.locator("#offline")).to_be_visible()
     assert page.evaluate(PALE) == {}
