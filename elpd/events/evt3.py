@@ -276,4 +276,5 @@ def decode(  # noqa: C901  (one function: calls cost)
     state[EVENTS] += n
     state[Y_OUT_OF_RANGE] += y_out
     state[X_OUT_OF_RANGE] += x_out
-    return int(i), int(n)
+    taken: Any = np.int64(i)  # ``int`` would leave it unsigned, for kernels that know no signature of this one
+    return taken, int(n)

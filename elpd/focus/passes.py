@@ -84,7 +84,7 @@ class Pass:
 
     memory: EventMemory
     frames: Sequence[tuple[SensorUs, Sharpness]]
-    """Each frame's time and log S in each band."""
+    """Each frame's time and how sharp it is."""
     begun_us: SensorUs
     end_us: SensorUs
     sign: int
@@ -131,20 +131,15 @@ class Pass:
 
     def _in_motion(self, said: EventWitnesses, undated_um: float) -> list[Witness]:
         """Return what the events' image says of a scene that moves, whose turns tell nothing of the lag."""
-        if said.image is None or said.drift.isotropy < LEAST_ISOTROPY:
+        vertex = said.vertex(width=self.width_um)
+        if said.image is None or vertex is None or said.drift.isotropy < LEAST_ISOTROPY:
             return []
         lag = said.expected_lag
         # A tilt of a parabola moves its vertex by the square of its width.
         tilt = (VERTEX_IN_MOTION + VERTEX_PER_PX * said.drift.px) / sqrt(said.drift.isotropy)
         strayed_um = tilt * said.image.finest.width**2 / self.width_um
-        return [
-            replace(
-                one.with_lag(lag.at, float(np.hypot(lag.sigma, undated_um))),
-                sigma=float(np.hypot(one.sigma, strayed_um)),
-            )
-            for one in said.witnesses(width=self.width_um)
-            if one.name == "vertex"
-        ]
+        late = vertex.with_lag(lag.at, float(np.hypot(lag.sigma, undated_um)))
+        return [replace(late, sigma=float(np.hypot(vertex.sigma, strayed_um)))]
 
     def testify_under_a_lamp(self, locate: Callable[[SensorUs], float], window_us: float) -> Testimony:
         """Ask the curve of whole lamp periods, one point each *window_us*, and the frames."""

@@ -82,7 +82,12 @@ def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
     bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
-    return [*bands, np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)[middle]]
+    return [*bands, corner_image(image)[middle]]
+
+
+def corner_image(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the band of noise of an image, of its size."""
+    return np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,7 @@ and what waits for memory, the places of the pixels, does not wait behind a word
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from elpd.events.evt3 import EVENTS_PER_WORD, WORDS, decode
 from elpd.events.jit import kernel
@@ -17,6 +15,7 @@ from elpd.events.registers import MAX_SIDE, NO_ROW
 from elpd.vision.latch import LATCH, LISTED, latch_first_on
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 ROOM = LISTED + EVENTS_PER_WORD
@@ -52,8 +51,6 @@ def evt3_to_latch(
     listed: NDArray[np.int64],
 ) -> None:
     """Take ``words[position:]``: the ON events inside ``[begin_us, end_us)`` are kept, those outside it counted."""
-    at: Any = np.int64(position)
-    while at < words.shape[0]:
-        after, n = decode(words, at, state, ANY_COLUMN, ANY_ROW, t_us, x, y, on, triggers)
-        at = np.int64(after)  # the compiler may not know decode's own signature yet
+    while position < words.shape[0]:
+        position, n = decode(words, position, state, ANY_COLUMN, ANY_ROW, t_us, x, y, on, triggers)
         latch_first_on(t_us, x, y, on, n, begin_us, end_us, width, height, slots, full, before, tally, listed)

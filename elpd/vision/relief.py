@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elpd.vision.pairs import weighted_mode
-from elpd.vision.turns import BLOCKS
+from elpd.vision.turns import BLOCKS, weighted_median
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -75,8 +75,8 @@ class Parts:
             if int(here.sum()) < FEWEST_PAIRS:
                 continue
             values, weights = turns.middle[here], np.minimum(turns.weights[here], most)
-            at[part] = _median(values, weights)
-            spread = max(_NORMAL_MAD * _median(np.abs(values - at[part]), weights), least)
+            at[part] = weighted_median(values, weights)
+            spread = max(_NORMAL_MAD * weighted_median(np.abs(values - at[part]), weights), least)
             sigma[part] = _OF_MEDIAN * spread * float(np.sqrt(np.square(weights).sum())) / float(weights.sum())
         return cls(at, sigma)
 
@@ -137,9 +137,3 @@ def is_flat(there: Sequence[Parts], back: Sequence[Parts], within: float) -> boo
     if between > within**2 + doubt(within**2):  # so much even if it were just flat
         return False
     return True if between + doubt(max(between, 0.0)) <= within**2 else None
-
-
-def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    order = np.argsort(values)
-    summed = np.cumsum(weights[order])
-    return float(values[order[int(np.searchsorted(summed, 0.5 * summed[-1]))]])

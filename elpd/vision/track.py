@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from elpd.vision.astigmatism import Edges, edges_of
-from elpd.vision.bands import CORNER, band_energies, focus_of_bands
+from elpd.vision.bands import CORNER, band_energies, corner_image, focus_of_bands
 from elpd.vision.drift import shift_px
 from elpd.vision.integral import (
     BANDS_PX,
@@ -289,8 +289,7 @@ class EventEnergy:
 
 
 def _fine(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    corner = np.asarray(cv2.filter2D(image, cv2.CV_32F, CORNER), dtype=np.float32)
-    return [band_image(image, BANDS_PX[0]), corner]
+    return [band_image(image, BANDS_PX[0]), corner_image(image)]
 
 
 @cache

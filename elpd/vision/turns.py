@@ -242,7 +242,7 @@ class _Regression:
             if not kept.any():
                 break
             inside = np.abs(residual) <= cut
-            scatter = _median(np.abs(residual[inside]), self._weights[inside]) / 0.6745
+            scatter = weighted_median(np.abs(residual[inside]), self._weights[inside]) / 0.6745
             cut = min(cut, max(BIWEIGHT * scatter, self._least))
         return _Fit(at, cut, kept, scatter)
 
@@ -279,7 +279,8 @@ def _step(
     return solved, kept, values - design @ solved
 
 
-def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Return the value that half of the weights lie up to; 0 without any."""
     order = np.argsort(values)
     summed = np.cumsum(weights[order])
     if not summed.size or summed[-1] <= 0.0:

@@ -137,36 +137,39 @@ class EventWitnesses:
         *unexplained* is the share of the lag that may be wrong. *width* is the curve's own, where it is known
         beforehand; without it, pairs are believed only beside an image.
         """
-        found: list[Witness] = []
-        if self.image is None and width is None:
-            return found
-        width = width if width is not None or self.image is None else self.image.finest.width
-        assert width is not None
-        if self.in_focus:  # the lag's own error holds it
-            unexplained = 0.0
-        shared = float(np.hypot(unexplained * self.lag.at, self.lag.sigma))
-        stray = stray_share(self.pairs)
-        departure = 0.0
-        if self.image is not None:
-            departure = max(0.0, abs(self.image.departure) - self.image.sigma)  # what is beyond its own error
-            dull = (1.0 + HELD_BACK * self.held_back) * width
-            sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray * dull))
-            held = SYSTEMATIC_IMAGE * dull
-            found.append(Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at))
-        if self.pairs is not None and self.pairs.count >= MIN_PAIRS:
+        vertex = self.vertex(unexplained, width)
+        found = [] if vertex is None else [vertex]
+        if width is None and self.image is not None:
+            width = self.image.finest.width
+        if width is not None and self.pairs is not None and self.pairs.count >= MIN_PAIRS:
+            # What the image's departure is beyond its own error.
+            departure = 0.0 if self.image is None else max(0.0, abs(self.image.departure) - self.image.sigma)
             found.append(
                 Witness(
                     "pairs",
                     self.pairs.at,
                     float(np.hypot(self.pairs.sigma, PAIRS_DEPART * departure)),
-                    shared,
+                    self._shared(unexplained),
                     freed=self.pairs_lag,
-                    astray=stray * width,
+                    astray=stray_share(self.pairs) * width,
                     apart=0.0 if self.turns is None else halves_apart(self.turns),
                     optics=SYSTEMATIC_PAIRS * width,
                 )
             )
         return found
+
+    def vertex(self, unexplained: float = LAG_UNEXPLAINED, width: float | None = None) -> Witness | None:
+        """Return the image's alone, on the same terms; ``None`` without an image."""
+        if self.image is None:
+            return None
+        dull = (1.0 + HELD_BACK * self.held_back) * (self.image.finest.width if width is None else width)
+        sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray_share(self.pairs) * dull))
+        shared, held = self._shared(unexplained), SYSTEMATIC_IMAGE * dull
+        return Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at)
+
+    def _shared(self, unexplained: float) -> float:
+        share = 0.0 if self.in_focus else unexplained  # where it is in focus, the lag's own error holds it
+        return float(np.hypot(share * self.lag.at, self.lag.sigma))
 
 
 def stray_share(pairs: Mode | None) -> float:
