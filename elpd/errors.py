@@ -33,8 +33,9 @@ class ElpdError(Exception):
     kind: ClassVar[str] = "ElpdError"
 
     def __init_subclass__(cls) -> None:
-        """Take the class's name for the stable word of the JSON interfaces, unless the class says another."""
-        cls.kind = cls.__dict__.get("kind", cls.__name__)
+        """Take the class's name for the stable word of the JSON interfaces, unless it says another or is private."""
+        if not cls.__name__.startswith("_"):
+            cls.kind = cls.__dict__.get("kind", cls.__name__)
 
 
 class UsageError(ElpdError):

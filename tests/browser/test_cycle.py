@@ -103,8 +103,21 @@ def test_a_stop_that_does_not_get_through_says_so_and_stays(opened: Opener, rig:
     expect(page.locator("#offline-title")).to_have_text("The daemon is away")
     expect(page.locator("#stop")).to_be_enabled()
     page.click("#stop")
-    expect(page.locator(".trouble")).to_contain_text("STOP did not get through")
-    expect(page.locator(".trouble")).to_contain_text("rig's own switch")
+    expect(page.locator(".trouble")).to_contain_text(re.compile("STOP did not get through.*rig's own switch"))
+
+
+def test_what_the_page_asked_by_itself_is_not_told_when_the_daemon_goes_before_it_answers(
+    opened: Opener, rig: Rig
+) -> None:
+    opened.expected = (REFUSED,)
+    rig.put(silent={"roi"})
+    page = opened(wait=False)
+    rig.asked_for("roi")
+    with page.expect_response(re.compile("api/roi")) as gone:
+        rig.stop()
+    assert (gone.value.status, gone.value.json()["error"]["kind"]) == (503, "Unreachable")
+    expect(page.locator("#offline-title")).to_have_text("The daemon is away")
+    expect(page.locator("#trouble")).to_be_empty()
 
 
 def test_stop_finds_a_way_past_commands_and_pictures_that_nobody_answers(opened: Opener, rig: Rig) -> None:

@@ -2,7 +2,7 @@
 
 import { ask } from "./api.js";
 import { $, make, say, show } from "./dom.js";
-import { trouble } from "./notices.js";
+import { unasked } from "./notices.js";
 import { live, mayOperate } from "./store.js";
 import { MODES, um } from "./words.js";
 
@@ -47,7 +47,7 @@ export function mountKeep(store, { act }) {
   store.listen((state) => {
     const now = live(state);
     if (now && !wasLive) {
-      ask("presets").then((answer) => list(answer.presets), (error) => trouble(error.message));
+      ask("presets").then((answer) => list(answer.presets), unasked);
       ask("mode").then(({ period_s: period }) => period && ($("period").value = period), () => {});
     }
     wasLive = now;

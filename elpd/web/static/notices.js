@@ -17,6 +17,11 @@ export function trouble(message, { lasting = false } = {}) {
   if (!lasting) setTimeout(() => note.remove(), SHOWN_MS);
 }
 
+const AWAY = new Set(["Offline", "Unreachable"]);
+
+/** Tell of a question that the page asked by itself. That the daemon is away is told where it belongs; the page asks again. */
+export const unasked = (error) => AWAY.has(error.kind) || trouble(error.message);
+
 /** For those who do not see the page. */
 export const speak = (text) => say($("spoken"), prose(text));
 

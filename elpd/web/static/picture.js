@@ -3,7 +3,7 @@
 
 import { ask, command, picture } from "./api.js";
 import { $, make, save, say, show } from "./dom.js";
-import { speak, trouble } from "./notices.js";
+import { speak, trouble, unasked } from "./notices.js";
 import { regionEditor } from "./region.js";
 import { same } from "./roi.js";
 import { live, mayOperate } from "./store.js";
@@ -149,7 +149,7 @@ export function mountPicture(store) {
     const now = live(state);
     if (now && !wasLive) {
       const before = sent;
-      ask("roi").then((answer) => takeRegions(answer, before), (error) => trouble(error.message));
+      ask("roi").then((answer) => takeRegions(answer, before), unasked);
       refresh();
     }
     wasLive = now;
