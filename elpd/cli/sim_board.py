@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 
-PRIORITY = -10
-"""Its niceness where the user may ask for that: a controller's processor is its own."""
-
 
 @click.command()
 @click.argument("board")
@@ -46,7 +43,7 @@ def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *,
     # a shell's background jobs ignore SIGINT; this one must not
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(PermissionError):  # what it plays does not wait for whoever is busy on this machine
-        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     # blocked before the serving thread exists, so that it inherits the mask and this thread gets the signal
     signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
