@@ -11,14 +11,16 @@ import naive_baselines as naive
 import numpy as np
 import pytest
 from benchmarks.cases import Case, cases_of, load_or_make, make
-from benchmarks.methods import Row, all_methods, aperture_picture, run_method
+from benchmarks.methods import all_methods, run_method
 from benchmarks.optics import FocusRenderer, cubic_weights, fold_spectrum, load_psf
 from benchmarks.plots import Plot, Series, draw
 from benchmarks.recorded import read_recorded, recorded_cases
 from benchmarks.retina import Retina, cross_thresholds, lin_log
+from benchmarks.rows import Row
 from benchmarks.scoring import scores
 from benchmarks.sets import APERTURE_US, MAP, REBUILT, SETS, STD
 from benchmarks.shake import MOTIONS, shifts_px
+from benchmarks.starts import aperture_picture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import SHARED, needs_shared

@@ -17,8 +17,8 @@ from benchmarks.executors import edition
 from benchmarks.goals import verdicts
 from benchmarks.limit import SignLimit, sign_sigma_um
 from benchmarks.live import read_live
-from benchmarks.methods import Row
 from benchmarks.retina import RetinaEvents
+from benchmarks.rows import Row
 from benchmarks.runner import Task
 from benchmarks.shutter import Shutter
 from benchmarks.verdict import MET, NOT_MET, SO_FAR, UNMEASURED, Verdict, tell

@@ -22,7 +22,7 @@ from benchmarks.sets import SETS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 BEYOND_TWO_SIGMA = math.erfc(2.0 / math.sqrt(2.0))
 _DRAWN = 8.0

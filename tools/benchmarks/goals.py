@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from benchmarks.live import LiveRun
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 OFFLINE = "recorded sweeps"
 BESIDE = ("egs", "pbf", "esva", "elp-syn", "elp-syn-1fps", "elp-davis", "elp-evk4")

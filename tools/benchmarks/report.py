@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from benchmarks.calibration import Calibration
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
     from benchmarks.scoring import Score
     from benchmarks.sets import CaseSet
     from benchmarks.verdict import Verdict

@@ -17,7 +17,7 @@ from benchmarks.sets import SETS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 
 @dataclass(frozen=True, slots=True)
