@@ -145,6 +145,13 @@ class Turns:
         return np.asarray(self.weights * (np.abs(self.middle - self.mode) <= 2.0 * self.width), dtype=np.float64)
 
     @property
+    def mean_square_gap(self) -> float:
+        """How long the pairs about the mode are: the weighted mean of their gaps' squares, 0 without any."""
+        weights = self.near
+        total = float(weights.sum())
+        return float(weights @ np.square(self.gap)) / total if total > 0.0 else 0.0
+
+    @property
     def begin(self) -> float:
         """How far before the mode most pairs about it begin: with their first event."""
         weights = self.near

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from scenes_of_turns import turns_of_a_lag
 
 from elpd.vision.lag import Lag, average_lag, expected_lag, weights_of_lines
+from elpd.vision.pairs import Mode
 from elpd.vision.turns import Line, Slowness, Turns, blocks_of, lateness
+from elpd.vision.witness import LOPSIDED_PAIRS, SYSTEMATIC_PAIRS, EventWitnesses
 
 
 def test_the_lag_of_dark_pixels_is_measured() -> None:
@@ -163,3 +165,24 @@ def test_pairs_in_two_heaps_have_no_line_between_them(seed: int) -> None:
     line, late = turns.line(Slowness(rng.uniform(1.0, 20.0, count), np.zeros(count)))
     assert line is None or abs(20.0 * line.slope) < 1.0, "at most along one of them"
     assert late.shape == (count,)
+
+
+def test_long_pairs_know_focus_the_less_the_more_lopsided_a_lens_may_be() -> None:
+    """Of pairs as long as six widths a mean over many passes says no better where focus is; of short ones it does."""
+    count, width = 200, 30.0
+    middle = np.random.default_rng(3).normal(0.0, 1.0, count)
+
+    def optics(widths: float) -> float:
+        gap = np.full(count, widths * width)
+        turns = Turns(middle, gap, np.ones(count), np.arange(count) % 16, 0.0, 4.5, 24.0)
+        assert turns.mean_square_gap == pytest.approx((widths * width) ** 2)
+        said = EventWitnesses(None, Mode(0.0, 0.1, float(count), 1.0), Lag(), turns=turns)
+        return next(one.optics for one in said.witnesses(width=width) if one.name == "pairs")
+
+    assert optics(0.1) == pytest.approx(SYSTEMATIC_PAIRS * width, rel=0.02)
+    assert optics(6.0) == pytest.approx(36.0 * LOPSIDED_PAIRS * width, rel=0.02)
+
+
+def test_no_pairs_have_no_length() -> None:
+    nothing = np.zeros(0)
+    assert Turns(nothing, nothing, nothing, nothing.astype(np.int64), 0.0, 1.0, 1.0).mean_square_gap == 0.0
