@@ -238,7 +238,7 @@ def test_third_party_sweeps_are_read_with_their_frames_and_truth() -> None:
 def row(error_um: float | None, decided_um: float = 30.0) -> Row:
     return Row(
         "syn-a-fov1-static", 1, "syn", "a", 1, "static", "pbf", "-", 100, error_um, None if error_um is None else 2.0,
-        None if error_um is None else decided_um, 500.0, 1.0, 0.5, 3.0, "", {},
+        None if error_um is None else decided_um, 500.0, 1.0, 0.5, 3.0, "",
     )  # fmt: skip
 
 

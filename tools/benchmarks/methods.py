@@ -56,6 +56,13 @@ class Method:
     rates: tuple[str, ...]
 
 
+def rate_name(rate: str) -> str:
+    """Return a frame rate in words."""
+    return {MAP: "temporal map", REBUILT: "rebuilt picture", E2VID: "E2VID picture", NO_FRAMES: "no frames"}.get(
+        rate, f"{rate} fps"
+    )
+
+
 def all_methods() -> dict[str, Method]:
     """Return every method by name, ours first."""
     methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, REBUILT, E2VID, NO_FRAMES))}
