@@ -43,7 +43,7 @@ def test_in_the_dark_focus_is_crossed_again_and_known_better_than_by_one_pass() 
     assert lived.focusing_ms > 60.0 + lived.again_ms  # the way to focus alone takes 60 ms
     assert lived.error_um is not None
     assert abs(lived.error_um) < 3.0
-    assert lived.estimate_um == pytest.approx(lived.error_um, abs=0.5)  # a step, and what the stop leaves
+    assert lived.estimate_um == pytest.approx(lived.error_um, abs=0.5)  # a step, and what the lens still swings
     assert lived.sigma_um is not None
     assert lived.one_pass_sigma_um is not None
     assert lived.sigma_um < 0.5 * lived.one_pass_sigma_um

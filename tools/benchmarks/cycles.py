@@ -2,7 +2,8 @@
 
 ``elpd.focus.FocusCycle`` is run on the case's rig as on any other, with everything that it does: it gets its picture,
 listens to the sensor at rest, sweeps, stops, asks its witnesses, goes over focus again where its own rule says that one
-pass is not enough (``elpd.focus.recross``), returns, and sees that the lens is there. What counts is where the glass
+pass is not enough (``elpd.focus.recross``), returns, and sees that the lens is there. Its settings are those that a
+configuration has unless it says otherwise, but for the case's speed and depth of focus. What counts is where the glass
 rests.
 """
 
@@ -75,7 +76,6 @@ def live_through(case: Case, rate: str) -> Lived:
     parts, camera, glass = build_rig(case, rate)
     settings = CycleSettings(
         speed_um_s=abs(chosen.speed_um_s),
-        backlash_um=0.0,
         depth_of_focus_um=chosen.depth_of_focus_um,
         deadline_ms=LONGEST_MS,
         transmittance="linear",
@@ -90,14 +90,15 @@ def live_through(case: Case, rate: str) -> Lived:
     except ElpdError as error:
         return Lived(cpu_ms(), f"{error.kind}: {error}", notes.direction)
     focused = result.outcome is Outcome.FOCUSED
-    sweep_sign = int(result.details.get("sweep_sign", 1))
+    sweep_sign = int(result.details.get("sweep_sign", 0))
+    focus_um = glass.focus_um(sweep_sign)
 
     def took_ms(*phases: Phase) -> float:
         names = [phase.value for phase in phases]
         return sum(one.ms for one in result.phases if one.name in names)
 
     def beyond_um(place_um: float | None) -> float | None:
-        return None if place_um is None or not focused else place_um - glass.focus_um
+        return None if place_um is None or not focused else place_um - focus_um
 
     stopped_um = beyond_um(result.stop_um)
 
@@ -112,10 +113,10 @@ def live_through(case: Case, rate: str) -> Lived:
         reason="" if focused else f"{result.outcome.value}: {result.reason}",
         direction=notes.direction,
         estimate_um=beyond_um(result.focus_um),
-        one_pass_um=None if not notes.one_pass else notes.one_pass["focus_um"] - glass.focus_um,
+        one_pass_um=None if not notes.one_pass else notes.one_pass["focus_um"] - focus_um,
         one_pass_sigma_um=notes.one_pass.get("sigma_um"),
         contributions=[
-            {"name": name, "at_um": at_um - glass.focus_um, "sigma_um": sigma_um, "weight": weight}
+            {"name": name, "at_um": at_um - focus_um, "sigma_um": sigma_um, "weight": weight}
             for name, at_um, sigma_um, weight in result.details.get("contributions", [])
         ],
     )

@@ -11,9 +11,9 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.calibration import BEYOND_TWO_SIGMA, draw_calibration
-from benchmarks.methods import CYCLE, OURS, all_methods, rate_name
-from benchmarks.plots import Plot, Series, draw
-from benchmarks.sets import MAP, SETS
+from benchmarks.figures import curves, errors, per_method
+from benchmarks.methods import CYCLE, OURS, all_methods
+from benchmarks.sets import SETS
 from benchmarks.verdict import MET, NOT_MET, UNMEASURED, measured
 
 if TYPE_CHECKING:
@@ -26,38 +26,32 @@ if TYPE_CHECKING:
     from benchmarks.sets import CaseSet
     from benchmarks.verdict import Verdict
 
-PEERS_PLOTTED = (("elp-syn", "50"), ("elp-syn-1fps", "1"), ("elp-davis", "50"), ("elp-davis", "20"), ("elp-evk4", MAP),
-                 ("pbf", "-"), ("egs", "-"), ("esva", "-"))  # fmt: skip
-"""Beside ours at a set's best frame rate; no set has more than eight lines, which can still be told apart."""
-
 COLUMNS = {
     "cases": "cases",
     "MAE um": "mae_um",
+    "paper MAE": "published_um",
+    "rerun MAE": "rerun_um",
     "bias": "bias_um",
     "worst": "worst_um",
     "limit": "limit_um",
-    "to sharpest": "to_sharpest_um",
     "missed": "missed",
     "outside": "outside",
     "early": "early",
     "wrong way": "wrong_way",
-    "decided um": "decided_um",
-    "to focus ms": "focusing_ms",
-    "crossed again": "crossed_again",
-    "of it ms": "again_ms",
-    "CPU ms": "cpu_ms",
     "rms err/σ": "spread",
     "beyond 2σ": "beyond_two",
-    "paper MAE": "published_um",
+    "to focus ms": "focusing_ms",
     "paper to focus ms": "published_focusing_ms",
+    "crossed again": "crossed_again",
+    "of it ms": "again_ms",
+    "decided um": "decided_um",
+    "to sharpest": "to_sharpest_um",
+    "CPU ms": "cpu_ms",
     "paper run ms": "published_cpu_ms",
-    "rerun MAE": "rerun_um",
 }
 COUNTS_OF_TROUBLE = ("missed", "outside", "early", "wrong_way")
 SIGNED = ("bias_um", "decided_um")
 BAD = " class='bad'"
-
-WORST_DRAWN_UM = 400.0
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1900px; padding: 0 1rem; color: #111 }
@@ -124,12 +118,12 @@ def write_report(
             body.append(_score_table([score for score in own_scores if score.motion == motion]))
         body.append("<h3>How errors are distributed</h3><div class='plots'>")
         for motion in motions:
-            body.extend(_errors([row for row in own_rows if row.motion == motion], motion))
+            body.extend(errors([row for row in own_rows if row.motion == motion], motion))
         body.extend(draw_calibration(own_rows, "|error|/σ", method) for method in _asked(own_rows))
         body.append(
-            f"</div>{_per_method(own_rows)}<h3>ELP as published, filtered, over the sweep</h3><div class='plots'>"
+            f"</div>{per_method(own_rows)}<h3>ELP as published, filtered, over the sweep</h3><div class='plots'>"
         )
-        body.extend(_curves(own_rows, motions))
+        body.extend(curves(own_rows, motions))
         body.append("</div>")
         body.append(_case_table(own_rows))
     page = (
@@ -271,90 +265,6 @@ def _case_table(rows: Sequence[Row]) -> str:
 def _asked(rows: Sequence[Row]) -> list[str]:
     """Return which of ours there are."""
     return [method for method in (OURS, CYCLE) if any(row.method == method for row in rows)]
-
-
-def _errors(rows: Sequence[Row], motion: str) -> list[str]:
-    """Draw the shares of *all* cases with an error below x: ours at all frame rates, and the peers beside the best."""
-    pairs = list(dict.fromkeys((row.method, row.rate) for row in rows))
-    best = SETS[rows[0].set_name].rates[0]
-    ours = [pair for pair in pairs if pair[0] in (OURS, CYCLE)]
-    beside = [pair for pair in ours if pair[1] == best] + [pair for pair in PEERS_PLOTTED if pair in pairs]
-    return [_distribution(rows, ours, f"{motion}, ours"), _distribution(rows, beside, f"{motion}, peers beside ours")]
-
-
-def _distribution(rows: Sequence[Row], pairs: Sequence[tuple[str, str]], title: str) -> str:
-    """Draw a line for each of *pairs*; those that do not reach one have misses."""
-    series = []
-    for method, rate in pairs:
-        own = [row for row in rows if (row.method, row.rate) == (method, rate)]
-        errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
-        if errors:
-            # A staircase, drawn on to the right edge at the share that had an answer at all.
-            corners = [corner for error in errors for corner in (error, error)] + [WORST_DRAWN_UM]
-            shares = [step / len(own) for k in range(len(errors)) for step in (k, k + 1)] + [len(errors) / len(own)]
-            series.append(Series(_label(method, rate), corners, shares))
-    marks = [(SETS[row.set_name].depth_of_focus_um, "depth of focus") for row in rows[:1]]
-    return draw(
-        Plot(
-            f"{title}: share of cases below an error", "|error| um", "share of all cases", series,
-            log_x=True, x_range=(0.02, WORST_DRAWN_UM), y_range=(0.0, 1.0), marks=marks,
-        )
-    )  # fmt: skip
-
-
-def _per_method(rows: Sequence[Row]) -> str:
-    """Draw each method's signed errors, a line per motion and frame rate: the share of all its cases below x."""
-    plots = []
-    for name in dict.fromkeys(row.method for row in rows):
-        own = [row for row in rows if row.method == name]
-        series = []
-        for motion, rate in dict.fromkeys((row.motion, row.rate) for row in own):
-            group = [row for row in own if (row.motion, row.rate) == (motion, rate)]
-            errors = sorted(row.error_um for row in group if row.error_um is not None)
-            corners = [corner for error in errors for corner in (error, error)]
-            shares = [step / len(group) for k in range(len(errors)) for step in (k, k + 1)]
-            series.append(Series(f"{motion}, {rate}", corners, shares))
-        limit_um = 4.0 * SETS[own[0].set_name].depth_of_focus_um
-        title = f"{all_methods()[name].title}: signed error"
-        plots.append(
-            draw(
-                Plot(
-                    title, "error um (late is positive)", "share of cases below", series,
-                    x_range=(-limit_um, limit_um), y_range=(0.0, 1.0), marks=[(0.0, "truth")],
-                )
-            )
-        )  # fmt: skip
-    told = "Every method's signed errors; what lies further out than four depths of focus is drawn at the edge"
-    return f"<details><summary>{told}</summary><div class='plots'>{''.join(plots)}</div></details>"
-
-
-def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
-    """Draw the published ELP of the first case of each motion, at 50 fps and with the one future frame."""
-    plots = []
-    for motion in motions:
-        first = next(((row.case, row.seed) for row in rows if row.motion == motion and "curve" in row.details), None)
-        series, marks = [], [(0.0, "truth")]
-        for row in rows:
-            if (row.case, row.seed) != first or "curve" not in row.details:
-                continue
-            curve = row.details["curve"]
-            series.append(
-                Series(
-                    _label(row.method, row.rate),
-                    [SETS[row.set_name].position_um(t_us) for t_us in curve["t_us"]],
-                    curve["elp"],
-                )
-            )
-            if row.decided_um is not None:
-                marks.append((row.decided_um, f"decided, {_label(row.method, row.rate)}"))
-        plots.append(
-            draw(Plot("" if first is None else first[0], "lens position um", "ELP per event", series, marks=marks))
-        )
-    return plots
-
-
-def _label(method: str, rate: str) -> str:
-    return method if rate == "-" and method not in (OURS, CYCLE) else f"{method}, {rate_name(rate)}"
 
 
 def _number(value: float | None, *, signed: bool = False) -> str:

@@ -3,7 +3,8 @@
 A recorded case has been swept once, whoever looks at it. Here the same scene moves as it does there, behind the same
 lens and before the same sensor, and the picture of every step is that of where the lens is by then. The sensor has been
 looking since the rig was started, so that a second pass goes on with the pixels as the first has left them. The lens is
-the simulated one behind a simulated Tic controller, without play; camera and host add no delay.
+the simulated rig's behind a simulated Tic controller, with the rig's play between motor and carriage; camera and host
+add no delay.
 """
 
 from __future__ import annotations
@@ -76,14 +77,18 @@ class CaseLens:
     """The glass: where it is, and where it is in focus, um from the lower end of its travel."""
 
     def __init__(self, focus_um: float, travel_um: float) -> None:
-        self.focus_um = focus_um
+        self._focus_um = focus_um
         self.travel_um = travel_um
-        mechanics = LensMechanics(um_per_step=UM_PER_STEP, travel_um=travel_um, backlash_um=0.0)
-        self.mechanism = SimulatedLens(mechanics, start_um=ROOM_UM)
+        self._mechanics = LensMechanics(um_per_step=UM_PER_STEP, travel_um=travel_um)
+        self.mechanism = SimulatedLens(self._mechanics, start_um=ROOM_UM)
+
+    def focus_um(self, sweep_sign: int) -> float:
+        """Return focus on the motor's ruler while the carriage is pushed in a direction (+1, -1; 0: mid-play)."""
+        return self._focus_um + sweep_sign * self._mechanics.backlash_um / 2
 
     def defocus_um(self, when: int) -> float:
         """Return how far the glass is beyond focus at a host instant."""
-        return float(self.mechanism.carriage_um(np.array([when], np.int64))[0]) - self.focus_um
+        return float(self.mechanism.carriage_um(np.array([when], np.int64))[0]) - self._focus_um
 
 
 class CaseAperture:
