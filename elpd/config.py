@@ -48,6 +48,8 @@ class LensSection(DeviceSection):
     speed_um_s: Positive = 4000.0
     backlash_um: Annotated[float, Field(ge=0)] = 6.0
     """Upper bound of the play between motor and carriage: the final approach overshoots by this much and a margin."""
+    measured_play_um: tuple[Annotated[float, Field(ge=0)], Positive] | None = None
+    """The play itself and its standard error, where it was measured; without it, it is anything up to the bound."""
     first_direction: Literal["auto", "up", "down"] = "auto"
     """Which way to probe first; ``auto`` is towards the longer way to a limit."""
 

@@ -28,6 +28,6 @@ def as_measured(config: Config) -> Config:
             config = config.model_copy(update={"lens": lens})
     play = backlash_profile(config)
     if play is not None:
-        lens = config.lens.model_copy(update={"backlash_um": play.approach_um})
+        lens = config.lens.model_copy(update={"backlash_um": play.approach_um, "measured_play_um": play.measured_um})
         config = config.model_copy(update={"lens": lens})
     return config

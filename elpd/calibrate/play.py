@@ -26,6 +26,10 @@ SURELY_SIGMAS = 3.0
 """The final approach begins behind the target by the play and so many of its standard errors."""
 
 
+LEAST_SIGMA_UM = 0.01
+"""No play is the same to less than a hundredth of a micrometre twice."""
+
+
 class Reading(BaseModel):
     """Where one pass saw focus, on the motor's ruler; ``speed_um_s`` is signed."""
 
@@ -48,10 +52,16 @@ class BacklashCalibration(Profile):
     readings: tuple[Reading, ...]
 
     @property
-    def approach_um(self) -> float:
-        """How far behind its target a final approach must begin. Zero play is possible, negative is not."""
+    def measured_um(self) -> tuple[float, float]:
+        """The play and its standard error. Zero play is possible, negative is not."""
         value, sigma = self.backlash_um.value or 0.0, self.backlash_um.sigma or 0.0
-        return max(value, 0.0) + SURELY_SIGMAS * sigma
+        return max(value, 0.0), max(sigma, LEAST_SIGMA_UM)
+
+    @property
+    def approach_um(self) -> float:
+        """How far behind its target a final approach must begin."""
+        value, sigma = self.measured_um
+        return value + SURELY_SIGMAS * sigma
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,7 +219,7 @@ class FocusCycle:
             WatchSettings(
                 settings.speed_um_s,
                 settings.depth_of_focus_um,
-                Play.up_to(settings.backlash_um),
+                Play.known(settings),
                 frames=picture.map is None,
                 background_activity_us=settings.background_activity_us,
             ),

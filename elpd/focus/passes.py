@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from elpd.focus.settings import CycleSettings
     from elpd.records import FocusEstimate
     from elpd.vision.flicker import Flicker
     from elpd.vision.memory import EventMemory
@@ -184,6 +185,13 @@ class Play:
     def up_to(cls, most_um: float) -> Play:
         """Return what is known of a play of which only an upper bound is: evenly anything below it."""
         return cls(0.5 * most_um, most_um / sqrt(12.0))
+
+    @classmethod
+    def known(cls, settings: CycleSettings) -> Play:
+        """Return what a rig's settings say of its play: what was measured, or no more than the bound."""
+        if settings.measured_play_um is not None:
+            return cls(*settings.measured_play_um)
+        return cls.up_to(settings.backlash_um)
 
 
 NO_PLAY = Play(0.0, 0.0)

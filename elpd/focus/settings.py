@@ -22,6 +22,7 @@ class CycleSettings:
 
     speed_um_s: float = 4000.0
     backlash_um: float = 6.0
+    measured_play_um: tuple[float, float] | None = None
     first_direction: Literal["auto", "up", "down"] = "auto"
     roi_fraction: float = 0.4
     depth_of_focus_um: float = 6.0
@@ -45,6 +46,7 @@ class CycleSettings:
         return cls(
             speed_um_s=speed_um_s,
             backlash_um=config.lens.backlash_um,
+            measured_play_um=config.lens.measured_play_um,
             first_direction=config.lens.first_direction,
             **focus,
         )

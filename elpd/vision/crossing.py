@@ -20,7 +20,7 @@ from elpd.vision.image_focus import band_energy_image, image_focus, sharpness_cu
 from elpd.vision.integral import BANDS_PX, band_gain, inside_margin
 from elpd.vision.lag import Lag, average_lag
 from elpd.vision.light import worth_of_an_event
-from elpd.vision.pair_focus import PAIRS_REACH, SMOOTH_IN_FOCUS, SMOOTH_PAIRS, Lateness, as_known, lag_of, pair_mode
+from elpd.vision.pair_focus import PAIRS_REACH, Lateness, as_known, lag_of, pair_mode
 from elpd.vision.pairs import find_pairs
 from elpd.vision.planes import find_planes, flank_width
 from elpd.vision.rebuilt import EventStretch, busiest_rows, by_pixel, hush, rebuilt, rows_of
@@ -141,7 +141,6 @@ def ask_events(
         light.slow,
         unmeasured_lag,
         calibrated,
-        (SMOOTH_IN_FOCUS if light.focused else SMOOTH_PAIRS) * width,
         focused=light.focused,
     )
     planes = find_planes(found, events, groups, at_peak, (begin, peak, end), late.candidates[0].at * light.plain)

@@ -20,14 +20,6 @@ if TYPE_CHECKING:
     from elpd.vision.lag import LagPrior
     from elpd.vision.turns import Line
 
-SMOOTH_PAIRS = 0.01
-"""How far, in widths of the curve, midpoints of bright pixels' pairs lie from those of dark ones for other reasons than
-lag, as a standard deviation over a picture's brightness: 27 still sweeps through four lenses have 0.007, and 0.010
-where the lens is aberrated most. Surfaces have their own brightness, and lenses their own focus for each size."""
-
-SMOOTH_IN_FOCUS = 0.015
-"""The same where the picture in focus was made of the events whose pairs are asked (8 still sweeps: 0.015)."""
-
 ASTRAY = 0.3
 """Share of stray pairs at which nothing that was measured on pairs is believed any more."""
 
@@ -69,7 +61,6 @@ def pair_mode(
     slownesses: list[Slowness],
     unmeasured_lag: float,
     calibrated: LagPrior | None,
-    smooth: float,
     *,
     focused: bool,
 ) -> tuple[Mode | None, Lateness]:
@@ -94,7 +85,7 @@ def pair_mode(
         unknown = [lag_of(None, unmeasured_lag / float(one.times.mean()), calibrated) for one in slownesses]
         return None, Lateness(unknown, np.ones(len(unknown)), unknown[0], unknown[0], np.zeros(2))
     x, y = pairs.x[believed], pairs.y[believed]
-    turns = Turns(middle, gap, weights, blocks_of(x, y, level.shape), mode.at, PAIRS_KERNEL * past, reach, smooth)
+    turns = Turns(middle, gap, weights, blocks_of(x, y, level.shape), mode.at, PAIRS_KERNEL * past, reach)
     slow = [one.at(y, x) for one in slownesses]
     usual = [float(np.average(one.times, weights=turns.near)) for one in slow]
     drawn = [turns.line(one) for one in slow]

@@ -56,6 +56,19 @@ def test_a_second_pass_is_the_way_back_and_ends_where_focus_has_been_seen_to_pas
         assert sum(told_ms[name] for name in ("sweep", "stop", "recross", "return", "verify")) < 160.0
 
 
+def test_a_play_that_was_measured_is_what_two_passes_allow_for() -> None:
+    """Half of what the rig has beyond the middle of what it may have, 4 um and 0 to 6, is what they were short by."""
+    rig = ("sim.motion=violent", "sim.camera=davis346", "sim.seed=3", "sim.start_um=-200")
+    told, measured = (play(*rig, *more).result for more in ((), ("lens.measured_play_um=[4.0, 0.1]",)))
+    assert told is not None
+    assert measured is not None
+    assert told.focus_um is not None
+    assert measured.focus_um is not None
+    assert measured.details["method"] == "two_crossings"
+    assert abs(measured.focus_um - told.focus_um) == pytest.approx(0.5 * (4.0 - 3.0), abs=0.1)
+    assert measured.sigma_um < told.sigma_um
+
+
 def test_a_doubtful_answer_is_looked_at_again_and_a_scene_that_lies_elsewhere_then_moves() -> None:
     story = shown("violent", 902)
     assert story.outcome is Outcome.FOCUSED

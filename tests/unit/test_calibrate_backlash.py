@@ -18,6 +18,8 @@ from elpd.calibrate.level_pairs import level_pairs
 from elpd.calibrate.play import BacklashCalibration, Reading, backlash_calibration
 from elpd.calibrate.profile import MeasuredOn, save
 from elpd.config import load
+from elpd.focus.passes import Play
+from elpd.focus.settings import CycleSettings
 from elpd.vision.pairs import find_pairs
 
 if TYPE_CHECKING:
@@ -112,6 +114,9 @@ def test_what_was_measured_replaces_the_configured_play(tmp_path: Path) -> None:
     used = as_measured(config).lens.backlash_um
     assert used == found.approach_um == found.backlash_um.value + 3 * (found.backlash_um.sigma or 0.0)
     assert as_measured(as_measured(config)) == as_measured(config)
+    play = Play.known(CycleSettings.from_config(as_measured(config)))
+    assert (play.um, play.sigma_um) == (found.backlash_um.value, found.backlash_um.sigma)
+    assert Play.known(CycleSettings.from_config(config)) == Play.up_to(6.0)
     for other in ("lens.um_per_step=0.5", "lens.steps_to_um=[[0, 0.0], [8000, 2000.0]]", "state.profiles=false"):
         assert as_measured(load(None, (f"state.directory={tmp_path}", other))).lens.backlash_um == 6.0
 
