@@ -323,13 +323,15 @@ class FocusEstimate:
     """Where focus is, on the ruler the caller used (um of lens travel), with one standard deviation.
 
     ``method`` is one of ``pairs``, ``crossing``, ``two_crossings``; ``contributions`` holds every estimator that had a
-    say: ``(name, focus_um, sigma_um, weight)``.
+    say: ``(name, focus_um, sigma_um, weight)``. ``lasting_um`` is the part of the standard deviation that is the same in
+    every pass, because the lens makes it.
     """
 
     focus_um: float
     sigma_um: float
     method: str
     contributions: tuple[tuple[str, float, float, float], ...] = ()
+    lasting_um: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ from elpd.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 QUICK = ("*-camera-fov1-*", "*-card-fov1-*")
 INTERRUPTED = 130

@@ -9,7 +9,7 @@ import argparse
 import json
 import random
 import sys
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "drivers"))
@@ -20,6 +20,8 @@ from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 
 MS = 1_000_000
 TRAVEL_STEPS = 40_000
+TICK_NS = 500
+"""Of the firmware's stamps."""
 
 
 @dataclass
@@ -83,9 +85,23 @@ def stops(count: int, seed: int) -> list[float]:
     return times
 
 
-def count_steps(wanted: int, seed: int) -> tuple[int, int, int]:
-    """Return steps made, commands sent and disagreements between the firmware's count and the pins."""
+@dataclass
+class Counted:
+    """Steps made, commands sent, and how often the firmware's count and its stamps were not what the pins did.
+
+    ``stamp_us`` is by how much its stamps of last steps strayed from the pin's own times, at the most.
+    """
+
+    made: int = 0
+    commands: int = 0
+    disagreements: int = 0
+    stamp_us: float = 0.0
+
+
+def count_steps(wanted: int, seed: int) -> Counted:
+    """Let it make *wanted* steps by random commands, and compare."""
     chance, bench, wrong, commands = random.Random(seed), Bench(), 0, 0  # noqa: S311
+    offsets_ns = []
     while bench.board.steps_made < wanted:
         draw = chance.random()
         commands += 1
@@ -99,9 +115,10 @@ def count_steps(wanted: int, seed: int) -> tuple[int, int, int]:
         if chance.random() < 0.2:
             bench.send(wire.HALT)
             bench.live(2)
-            if bench.ask(wire.STATUS).position != bench.board.pin_position:
-                wrong += 1
-    return bench.board.steps_made, commands, wrong
+            reply = bench.ask(wire.STATUS)
+            wrong += reply.position != bench.board.pin_position
+            offsets_ns.append(bench.last_step_ns - reply.step_stamp * TICK_NS)
+    return Counted(bench.board.steps_made, commands, wrong, (max(offsets_ns) - min(offsets_ns)) / 1000)
 
 
 def dead_man(limit_ms: int) -> float:
@@ -122,17 +139,20 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     times = sorted(stops(chosen.stops, chosen.seed))
-    made, commands, wrong = count_steps(chosen.steps, chosen.seed)
+    counted = count_steps(chosen.steps, chosen.seed)
     answer = {
         "stop_us": {"median": times[len(times) // 2], "worst": times[-1], "stops": len(times)},
-        "steps": {"made": made, "commands": commands, "disagreements": wrong},
+        "steps": asdict(counted),
         "dead_man_ms": {"limit": 200, "at_rest_after": dead_man(200)},
     }
     if chosen.json:
         print(json.dumps(answer))
         return
     print(f"stop byte to last step: median {times[len(times) // 2]:.1f} us, worst {times[-1]:.1f} us ({len(times)})")
-    print(f"step counter against the pins: {made} steps, {commands} commands, {wrong} disagreements")
+    print(
+        f"step counter against the pins: {counted.made} steps, {counted.commands} commands, "
+        f"{counted.disagreements} disagreements; stamps within {counted.stamp_us:.1f} us"
+    )
     print(f"dead-man of 200 ms: at rest {answer['dead_man_ms']['at_rest_after']:.1f} ms after the last word")
 
 

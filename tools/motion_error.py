@@ -10,7 +10,8 @@ the strategy; that error's median, 95th percentile and largest; how near the rot
 model, asked at random instants of the motion at once and after it, how often 1.96 of its standard deviations cover the
 truth, its median standard deviation in motion and at rest, and the error's own. A run that ends in a fault is named.
 
-The boards are wired straight to the host. With ``--adapters`` each seed has another USB adapter between, as slow as
+No two boards are alike: each seed's takes another time over commands, as far as its driver says not to know it. They
+are wired straight to the host. With ``--adapters`` each seed has another USB adapter between, as slow as
 drivers suppose of those that they open by name: how slow this one is, they are not told.
 """
 
@@ -54,6 +55,7 @@ SPEED_UM_S, ACCELERATION_UM_S2 = 4000.0, 400_000.0
 DEPTH_OF_FOCUS_UM = 6.0
 OWN_US = {"avr": 115.0, "grbl": 225.0, "scf4": 300.0, "theia": 300.0, "tic": 100.0, "tmcl": 250.0, "zaber": 300.0}
 """What the boards here take over a command by themselves, on average."""
+SQRT_2 = 2.0**0.5
 SEEN_MS = (3.0, 12.0)
 """How late it is noticed that focus was passed."""
 
@@ -147,14 +149,29 @@ def made(board: str, seed: int, start_um: float, *, adapters: bool = False) -> t
     mechanism = SimulatedLens(mechanics, start_um=start_um, history_s=100.0)
     wanted = Wanted(UM_PER_STEP, TRAVEL_UM, fastest_um_s, ACCELERATION_UM_S2)
     adapter_us = 0.0
+    own = of_its_own(board, seed)
     if adapters:
         usual_us, sigma_us = ADAPTER_LATENCY_US - OWN_US[board], ADAPTER_LATENCY_SIGMA_US
         adapter_us = max(0.0, float(random_stream(seed, "adapter").normal(usual_us, sigma_us)))
-    port, table = fitted(board, mechanism, wanted, world, seed=seed, adapter_ns=round(adapter_us * 1000))
+    port, table = fitted(board, mechanism, wanted, world, seed=seed, adapter_ns=round(adapter_us * 1000), own=own)
     if adapters:
         table = {**table, "latency_us": ADAPTER_LATENCY_US, "latency_sigma_us": ADAPTER_LATENCY_SIGMA_US}
     world.add(port)
     return world, mechanism, controller(board).open_lens(table, world, port)
+
+
+def of_its_own(board: str, seed: int) -> Mapping[str, Any]:
+    """Return how soon this seed's board obeys, in us: no two are alike, and a driver knows only what they may be.
+
+    It supposes half of the variance of a command's time to be chance, command by command, and half the board's own.
+    """
+    usual = getattr(controller(board).board.config(), "latency_us", None)
+    if usual is None:
+        return {}
+    middle_us, half_us = (usual[0] + usual[1]) / 2, (usual[1] - usual[0]) / 2
+    chance = random_stream(seed, "board")
+    own_us = middle_us + float(chance.uniform(-half_us, half_us)) / SQRT_2
+    return {"latency_us": (round(max(own_us - half_us / SQRT_2, 0.0)), round(own_us + half_us / SQRT_2))}
 
 
 def calibrated(board: str) -> Mapping[StopMode, StopTiming]:

@@ -1,7 +1,7 @@
 /* Steps: ramps, limits, the step counter and its time.
  *
- * Timer 1 runs freely at 2 MHz: its 16 bits and an overflow count are the clock of every stamp, and compare A makes the
- * steps. The ramp is the one of D. Austin, "Generate stepper-motor speed profiles in real time" (Embedded Systems
+ * Timer 1 runs freely at 2 MHz: compare A makes the steps, and its 16 bits, looked at once a millisecond at least, are
+ * the clock of every stamp. The ramp is the one of D. Austin, "Generate stepper-motor speed profiles in real time" (Embedded Systems
  * Programming, 2005): with n the number of steps that a ramp from rest has taken, the next interval is
  *
  *     c[n] = c[n-1] - 2 c[n-1] / (4 n + 1),      c[0] = 0.676 f sqrt(2 / a),
@@ -37,7 +37,7 @@ enum homing { HOMING_NOT, HOMING_IN, HOMING_OUT };
 /* Shared with the interrupts. */
 static volatile int32_t position;
 static volatile uint32_t step_stamp;
-static volatile uint16_t overflows;
+static volatile uint32_t looked; /* the time, in ticks, when somebody last asked */
 static volatile bool moving;
 static volatile bool braking;
 static volatile uint16_t notes; /* flags that latch until the next GO */
@@ -72,15 +72,13 @@ static inline bool at_min(void) { return !(PIND & (1u << LIMIT_MIN_BIT)); }
 static inline bool at_max(void) { return !(PIND & (1u << LIMIT_MAX_BIT)); }
 static inline bool blocked(int8_t way) { return way > 0 ? at_max() : at_min(); }
 
+/* The time goes on by what 16 bits say since the last look, which is never a whole turn of theirs ago. */
 static uint32_t ticks_now(void) {
     uint32_t now;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        uint16_t low = TCNT1;
-        uint16_t high = overflows;
-        if ((TIFR1 & (1u << TOV1)) && low < 0x8000u) {
-            high++;
-        }
-        now = ((uint32_t)high << 16) | low;
+        now = looked;
+        now += (uint16_t)(TCNT1 - (uint16_t)now);
+        looked = now;
     }
     return now;
 }
@@ -131,8 +129,6 @@ static void rest(void) {
     braking = false;
     ramp = 0;
 }
-
-ISR(TIMER1_OVF_vect) { overflows++; }
 
 /* Count the step that is being made; whether it leads to a multiple of sync_steps, from either side. */
 static inline bool sync_reached(void) {
@@ -222,8 +218,9 @@ ISR(TIMER1_COMPA_vect) {
     TIMSK1 |= 1u << OCIE1A;
 }
 
-/* Once a millisecond: how long nobody has spoken, how long this motion may go on. */
+/* Once a millisecond: what time it is, how long nobody has spoken, how long this motion may go on. */
 ISR(TIMER0_COMPA_vect) {
+    ticks_now();
     if (quiet_ms < UINT16_MAX) {
         quiet_ms++;
     }
@@ -245,7 +242,6 @@ void motion_init(void) {
     motion_configure(100000, max_speed, soft_min, soft_max, dead_man_ms, 0);
     TCCR1A = 0;
     TCCR1B = 1u << CS11;
-    TIMSK1 = 1u << TOIE1;
     TCCR0A = 1u << WGM01;
     TCCR0B = (1u << CS01) | (1u << CS00);
     OCR0A = F_CPU / 64 / 1000 - 1;

@@ -134,7 +134,8 @@ def measure_stops(trials: Sequence[StopTrial], set_sps2: float | None = None) ->
     Trials whose motion was not steady are left out; too few left is said so. *set_sps2* is the ramp that the controller
     is set to brake with, ``None`` for stops that should have none.
     """
-    narrowest_ns = min((int((one.cruise.latest_ns - one.cruise.earliest_ns).min()) for one in trials), default=0)
+    heard = [one.cruise for one in trials if one.cruise.steps.size]
+    narrowest_ns = min((int((one.latest_ns - one.earliest_ns).min()) for one in heard), default=0)
     gone: list[_Gone] = []
     kept: list[StopTrial] = []
     for trial in trials:
@@ -143,7 +144,13 @@ def measure_stops(trials: Sequence[StopTrial], set_sps2: float | None = None) ->
             gone.append(way)
             kept.append(trial)
     if len(gone) < FEWEST_STOPS or len({round(abs(one.speed_sps)) for one in kept}) < 2:
+        unheard = sum(one.cruise.steps.size < FEWEST_REPORTS for one in trials)
         why = f"only {len(gone)} of {len(trials)} stops came from a steady speed; allow more travel, or lower the speed"
+        if unheard:
+            why += (
+                f" (before {unheard} of them fewer than {FEWEST_REPORTS} reports came: "
+                "the line is slow, or the machine busy)"
+            )
         none = Quantity.none(why, "ms")
         return ModeFound(
             onset_ms=none,

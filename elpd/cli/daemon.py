@@ -71,8 +71,8 @@ def daemon_unless(
         return reach(socket=socket)
     except UnreachableError as error:
         raise BusyError(
-            "no daemon answers; start one, or work from this process with --foreground (the simulated rig), "
-            f"--config FILE or --set KEY=VALUE ({error})"
+            f"{error}; or work from this process with --foreground (the simulated rig), --config FILE "
+            "or --set KEY=VALUE"
         ) from None
 
 

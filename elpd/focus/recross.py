@@ -24,7 +24,6 @@ from elpd.focus.approach import APPROACH_MARGIN_UM
 from elpd.focus.passes import Play
 from elpd.records import StopMode
 from elpd.units import after_ms
-from elpd.vision.witness import SYSTEMATIC_PAIRS, WIDTHS_PER_DEPTH_OF_FOCUS
 
 if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings
@@ -88,9 +87,8 @@ def _pays(first: FocusEstimate, settings: CycleSettings) -> bool:
     It knows all but half the play, of which the bound is taken even if it was measured: what is good enough without
     another pass stays so. What the lens has of its own is in both.
     """
-    optics_um = SYSTEMATIC_PAIRS * WIDTHS_PER_DEPTH_OF_FOCUS * settings.depth_of_focus_um
     half_play_um = 0.5 * Play.up_to(settings.backlash_um).sigma_um
-    return first.sigma_um**2 - optics_um**2 > 2.0 * half_play_um**2
+    return first.sigma_um**2 - first.lasting_um**2 > 2.0 * half_play_um**2
 
 
 def _certain(estimate: FocusEstimate | None, settings: CycleSettings) -> bool:

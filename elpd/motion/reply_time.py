@@ -44,6 +44,8 @@ class ReplyTime:
         self._chance = self._whole / 2
         self._weight = SUPPOSED / (2 * self._chance**2) if self._chance else math.inf
         self._quickest_s = [math.inf] * QUICKEST
+        self._told: tuple[float, float] | None = None
+        """What is shared, until something is learnt; it is asked for with each position."""
         self.usual_ns = round(usual_ns)
         """The delay that replies are dated with."""
 
@@ -68,6 +70,7 @@ class ReplyTime:
         self._weight += weight
         self._chance += (seen - self._chance) * weight / self._weight
         self._chance = min(max(self._chance, 0.0), self._whole)
+        self._told = None
 
     def took(self, width_ns: float) -> bool:
         """Learn how long a reply took at the most; say whether replies are dated otherwise from now on."""
@@ -75,6 +78,7 @@ class ReplyTime:
         if self._weight == math.inf or width_s >= self._quickest_s[-1]:
             return False
         self._quickest_s = sorted([*self._quickest_s[:-1], width_s])
+        self._told = None
         usual_s, sigma_s = self._shared()
         if abs(usual_s * NS_PER_S - self.usual_ns) < MOVED * sigma_s * NS_PER_S:
             return False
@@ -82,6 +86,11 @@ class ReplyTime:
         return True
 
     def _shared(self) -> tuple[float, float]:
+        if self._told is None:
+            self._told = self._cut_off()
+        return self._told
+
+    def _cut_off(self) -> tuple[float, float]:
         """Return the shared delay and its standard deviation: a normal distribution, cut off at both ends."""
         if self._weight == math.inf:
             return self._supposed_s, 0.0

@@ -110,7 +110,10 @@ def default_path() -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if not runtime:
         place = SYSTEM_SOCKET.parent
-        raise ConfigError(f"api.socket: {place} may not be written and XDG_RUNTIME_DIR is not set; name a socket")
+        raise ConfigError(
+            f"api.socket: {place} may not be written and XDG_RUNTIME_DIR is not set; "
+            "name a socket, such as --set api.socket=./elpd.sock, and then --socket ./elpd.sock to each command"
+        )
     return Path(runtime, "elpd", "elpd.sock")
 
 

@@ -59,30 +59,31 @@ def band_energies(image: NDArray[np.float32], weight: NDArray[np.float32], margi
     *margin* pixels at each side are left out of the mean; of a small image less is: at least its middle eight pixels
     are measured.
     """
-    return freed_of_noise(band_products(image, image, weight, margin))
+    bands = filtered(image, margin)
+    return freed_of_noise(products(bands, bands, weight[inside_margin(image.shape, margin)]))
 
 
-def band_products(
-    one: NDArray[np.float32], other: NDArray[np.float32], weight: NDArray[np.float32], margin: int = 0
+def products(
+    one: Sequence[NDArray[np.float32]], other: Sequence[NDArray[np.float32]], weight: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return the weighted mean product of each band of two images, and last that of the band of noise: (bands + 1,)."""
-    middle = inside_margin(one.shape, margin)
-    first = _filtered(one, middle)
-    second = first if other is one else _filtered(other, middle)
-    return np.array(
-        [float((a * b * weight[middle]).mean(dtype=np.float64)) for a, b in zip(first, second, strict=True)]
-    )
+    """Return the weighted mean product of each band of two ``filtered`` images, and last that of the band of noise.
+
+    (bands + 1,); *weight* has the size of what is left of the images.
+    """
+    return np.array([float((a * b * weight).mean(dtype=np.float64)) for a, b in zip(one, other, strict=True)])
+
+
+def filtered(image: NDArray[np.float32], margin: int = 0) -> list[NDArray[np.float32]]:
+    """Return the bands of an image, and last that of noise, without the margin."""
+    middle = inside_margin(image.shape, margin)
+    bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
+    return [*bands, corner_image(image)[middle]]
 
 
 def freed_of_noise(energies: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract white noise from energies (..., bands + 1), the last of which measures it: (..., bands)."""
     raw = energies[..., :-1]
     return np.asarray(np.maximum(raw - _GAINS * energies[..., -1:], _FLOOR * raw))
-
-
-def _filtered(image: NDArray[np.float32], middle: tuple[slice, slice]) -> list[NDArray[np.float32]]:
-    bands = [band_image(image, scale_px)[middle] for scale_px in BANDS_PX]
-    return [*bands, corner_image(image)[middle]]
 
 
 def corner_image(image: NDArray[np.float32]) -> NDArray[np.float32]:

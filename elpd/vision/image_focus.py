@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from elpd.vision.bands import BandFocus, band_products, focus_of_bands, freed_of_noise
-from elpd.vision.integral import BANDS_PX, band_image, fit_vertex
+from elpd.vision.bands import BandFocus, filtered, focus_of_bands, freed_of_noise, products
+from elpd.vision.integral import BANDS_PX, band_image, fit_vertex, inside_margin
 from elpd.vision.planes import FLANK
 from elpd.vision.slowness import DARK
 
@@ -64,12 +64,20 @@ def sharpness_curves(
     scene that is as symmetric in defocus as the picture itself. In one that moves, the picture wanders over what is
     missing, and S wavers. What it is worth in events is known roughly at best, so several *worths* are tried.
     """
-    own = np.array([band_products(image, image, weight, margin) for image in images])
-    curves = [own]
+    weight = weight[inside_margin(images.shape[1:], margin)]
+    below = None
     if start is not None:
-        below = np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32)
-        mixed = np.array([band_products(image, below, weight, margin) for image in images])
-        under = band_products(below, below, weight, margin)
+        below = filtered(np.log(np.maximum(start, 0.0) + np.float32(DARK)).astype(np.float32), margin)
+    alone, with_start = [], []
+    for image in images:
+        seen = filtered(image, margin)
+        alone.append(products(seen, seen, weight))
+        if below is not None:
+            with_start.append(products(seen, below, weight))
+    own = np.array(alone)
+    curves = [own]
+    if below is not None:
+        mixed, under = np.array(with_start), products(below, below, weight)
         curves += [own + 2.0 * worth * mixed + worth**2 * under for worth in worths]
     return [np.log(freed_of_noise(one) + 1e-12) for one in curves]
 

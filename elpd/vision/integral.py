@@ -15,6 +15,7 @@ mismatch between pixels adds a pattern that is white in space; ``elpd.vision.ban
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import cv2
@@ -251,17 +252,22 @@ def _parabola(position: NDArray[np.float64], log_energy: NDArray[np.float64]) ->
     if scale <= 0.0:
         return None
     z = (position - middle) / scale
-    design = np.stack([np.ones_like(z), z, z * z], axis=1)
-    coefficients, *_ = np.linalg.lstsq(design, log_energy, rcond=None)
-    _, slope, curvature = (float(one) for one in coefficients)
+    # In polynomials that are orthogonal over these positions the coefficients do not depend on one another.
+    square = z * z
+    of_line = float(square.sum())
+    skew, mean_square = float(square @ z) / of_line, of_line / z.size
+    bend = square - skew * z - mean_square
+    of_bend = float(bend @ bend)
+    if of_bend <= 1e-12 * of_line:
+        return None  # two places only
+    mean = float(log_energy.mean())
+    slope, curvature = float(z @ log_energy) / of_line, float(bend @ log_energy) / of_bend
     if curvature >= 0.0:
         return None
-    at = -slope / (2.0 * curvature)
-    residual = log_energy - design @ coefficients
+    at = 0.5 * skew - slope / (2.0 * curvature)
+    residual = log_energy - mean - slope * z - curvature * bend
     freedom = position.size - 3
     variance = float(residual @ residual) / freedom if freedom > 0 else 0.0
-    covariance = np.linalg.pinv(design.T @ design) * variance
-    gradient = np.array([0.0, -1.0 / (2.0 * curvature), slope / (2.0 * curvature**2)])
-    sigma = float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
-    width = float(np.sqrt(-1.0 / (2.0 * curvature)))
+    sigma = sqrt(variance * (1.0 / of_line + (slope / curvature) ** 2 / of_bend)) / (-2.0 * curvature)
+    width = sqrt(-1.0 / (2.0 * curvature))
     return Vertex(middle + scale * at, scale * sigma, scale * width, int(position.size))

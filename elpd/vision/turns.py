@@ -267,9 +267,10 @@ class _Regression:
         slopes = []
         for one in blocks:
             left = block != one
+            of_left = design[left], self._middle[left], self._weights[left]
             at = full.at
             for _ in range(_AGAIN):
-                at, _, _ = _step(design[left], self._middle[left], self._weights[left], at, full.cut)
+                at, _, _ = _step(*of_left, at, full.cut)
             slopes.append(float(at[1]))
         return float((len(slopes) - 1) * np.var(slopes))
 

@@ -225,4 +225,5 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     contributions = tuple(
         (one.name, one.at, one.total_sigma, float(part)) for one, part in zip(witnesses, share, strict=True)
     )
-    return FocusEstimate(focus, sigma, "pairs" if main == "pairs" else "crossing", contributions)
+    lasting = abs(float(share @ np.array([one.optics for one in witnesses])))
+    return FocusEstimate(focus, sigma, "pairs" if main == "pairs" else "crossing", contributions, lasting)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 from elpd_drivers.lenses import avr_wire as wire
 from elpd_drivers.sim.boards import avr
@@ -89,6 +91,22 @@ def test_the_dead_man_brakes_when_nobody_speaks_and_says_so() -> None:
     assert reply.flags & wire.DEAD_MAN
     assert not reply.flags & wire.MOVING
     assert reply.position == bench.board.pin_position < 4000
+
+
+def test_stamps_tell_the_times_of_steps_through_many_turns_of_its_timer() -> None:
+    chance = random.Random(23)
+    bench = Bench()
+    offsets_us = []
+    for _ in range(40):
+        bench.ask(wire.GO, wire.go(chance.randrange(4001), chance.randrange(4000, 16_001)))
+        bench.live(chance.uniform(20.0, 200.0))
+        bench.send(wire.HALT)
+        bench.live(2)
+        reply = bench.ask(wire.STATUS)
+        assert reply.position == bench.board.pin_position
+        offsets_us.append(bench.board.last_step_ns / 1000 - reply.step_stamp / 2)
+    assert bench.now > 100 * 32 * MS
+    assert max(offsets_us) - min(offsets_us) < 10.0
 
 
 def test_sync_makes_an_edge_every_so_many_steps() -> None:

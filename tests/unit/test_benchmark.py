@@ -11,14 +11,16 @@ import naive_baselines as naive
 import numpy as np
 import pytest
 from benchmarks.cases import Case, cases_of, load_or_make, make
-from benchmarks.methods import Row, all_methods, aperture_picture, run_method
+from benchmarks.methods import all_methods, run_method
 from benchmarks.optics import FocusRenderer, cubic_weights, fold_spectrum, load_psf
 from benchmarks.plots import Plot, Series, draw
 from benchmarks.recorded import read_recorded, recorded_cases
 from benchmarks.retina import Retina, cross_thresholds, lin_log
+from benchmarks.rows import Row
 from benchmarks.scoring import scores
 from benchmarks.sets import APERTURE_US, MAP, REBUILT, SETS, STD
 from benchmarks.shake import MOTIONS, shifts_px
+from benchmarks.starts import aperture_picture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import SHARED, needs_shared
@@ -236,7 +238,7 @@ def test_third_party_sweeps_are_read_with_their_frames_and_truth() -> None:
 def row(error_um: float | None, decided_um: float = 30.0) -> Row:
     return Row(
         "syn-a-fov1-static", 1, "syn", "a", 1, "static", "pbf", "-", 100, error_um, None if error_um is None else 2.0,
-        None if error_um is None else decided_um, 500.0, 1.0, 0.5, 3.0, "", {},
+        None if error_um is None else decided_um, 500.0, 1.0, 0.5, 3.0, "",
     )  # fmt: skip
 
 

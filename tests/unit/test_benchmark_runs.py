@@ -17,9 +17,10 @@ from benchmarks.executors import edition
 from benchmarks.goals import verdicts
 from benchmarks.limit import SignLimit, sign_sigma_um
 from benchmarks.live import read_live
-from benchmarks.methods import Row
 from benchmarks.retina import RetinaEvents
+from benchmarks.rows import Row
 from benchmarks.runner import Task
+from benchmarks.scoring import scores
 from benchmarks.shutter import Shutter
 from benchmarks.verdict import MET, NOT_MET, SO_FAR, UNMEASURED, Verdict, tell
 
@@ -219,6 +220,22 @@ def test_a_goal_is_met_only_by_all_its_sweeps() -> None:
     )
 
 
+def test_a_goal_is_held_against_one_pass_and_against_whole_cycles_apart() -> None:
+    one_pass = all_of("dynamic", None, "davis-bright", focusing_ms=None)
+    crossed = all_of("dynamic", 0.5, "davis-bright", method="elpd-cycle", again_ms=80.0, focusing_ms=240.0)
+    crossed[0] = replace(crossed[0], again_ms=0.0, focusing_ms=150.0)
+    table = verdicts(one_pass + crossed)
+    once, cycles = (one for one in table if one.goal.startswith("davis-bright dynamic"))
+    assert (once.verdict, once.missed, once.other) == (NOT_MET, 7, "")
+    assert (cycles.source, cycles.verdict, cycles.missed) == ("whole cycles", MET, 0)
+    assert cycles.other == "to focus 240 ms, 6 of 7 crossed again, for 80 ms of it"
+    assert {one.source for one in table if one.goal.startswith("abstentions in shake")} == {once.source, cycles.source}
+    _, score = scores(one_pass + crossed)
+    assert (score.method, score.crossed_again, score.again_ms) == ("elpd-cycle", 6, 80.0)
+    truth = {one.name: one.answers for one in calibrations(one_pass + crossed)}
+    assert truth == {"whole cycles, all sets": 7, "whole cycles, davis-bright dynamic, 50": 7}
+
+
 def test_abstentions_early_stops_false_answers_and_directions_are_counted() -> None:
     shaken = all_of("shake", 1.0, "davis-bright", decided_um=-7.0)
     table = verdicts(shaken)
@@ -315,7 +332,7 @@ def test_true_sigmas_have_an_rms_of_one_and_false_ones_show() -> None:
         rows = [row(error_um=float(error), sigma_um=claimed) for error in rng.standard_normal(4_000)]
         rows += [row(error_um=50.0, method="pbf", sigma_um=None), row("nothing-wall-fov1-static", error_um=9.0)]
         every, only = calibrations(rows)
-        assert (every.name, only.name, every.answers) == ("all sets", "syn static, 50", 4_000)
+        assert (every.name, only.name, every.answers) == ("one pass, all sets", "one pass, syn static, 50", 4_000)
         assert every.rms == pytest.approx(rms, rel=0.04)
         assert every.beyond_two == pytest.approx(beyond, abs=0.02)
     assert "rms" in draw_calibration(rows, "true?")

@@ -84,6 +84,15 @@ def test_stops_from_no_steady_speed_are_no_evidence() -> None:
     assert "0 of 32 stops came from a steady speed" in (found.onset_ms.reason or "")
 
 
+def test_stops_before_which_nothing_was_heard_are_left_out_and_said_to_be() -> None:
+    made = trials(3, 45.0, 3.0, 400_000.0)
+    nothing = Cruise(np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    deaf = [StopTrial(one.mode, one.speed_sps, nothing, one.sent_ns, one.rest_steps, 60.0, 1.0) for one in made]
+    some = measure_stops([*made, *deaf[:5]], set_sps2=4_000_000.0)
+    assert some.timing() == measure_stops(made, set_sps2=4_000_000.0).timing()
+    assert "before 32 of them fewer than 4 reports came" in (measure_stops(deaf).onset_ms.reason or "")
+
+
 def bench(made: Rig, repeats: int = 2) -> LensBench:
     return LensBench(made.clock, made.lens, LensScale(UM_PER_STEP), speed_um_s=SPEED_UM_S, repeats=repeats)
 

@@ -165,7 +165,7 @@ def test_every_command_of_the_list_is_there_and_helps(elpd: Callable[..., Answer
         (["dance"], 2, "UsageError", "there is no command 'dance'; there are calibrate, cancel"),
         ([], 2, "UsageError", "No such option"),
         (["focus", "--foregruond"], 2, "UsageError", "No such option"),
-        (["focus"], 4, "BusyError", "no daemon answers"),
+        (["focus"], 4, "BusyError", "no daemon has made this socket"),
         (["focus", "--foreground", "--roi", "10,10,0,0"], 2, "UsageError", "empty"),
         (["focus", "--foreground", "--roi", "1200,10,200,200"], 2, "UsageError", "1280x720"),
         (["focus", "--foreground", "--roi", "1,2,3"], 2, "UsageError", "X,Y,W,H"),
@@ -281,7 +281,8 @@ def test_the_real_program_prints_json_alone_and_returns_its_code(tmp_path: Path)
     )
     assert ended.returncode == 4
     assert json.loads(ended.stdout)["error"]["kind"] == "BusyError"
-    assert ended.stderr.startswith("elpd: no daemon")
+    assert ended.stderr.startswith("elpd: ")
+    assert "no daemon has made this socket" in ended.stderr
 
 
 def test_the_wheel_takes_all_that_the_packages_need() -> None:

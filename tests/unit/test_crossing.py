@@ -269,3 +269,13 @@ def test_a_falling_position_gives_the_same_vertex() -> None:
     for k in range(60):
         track.add_sharpness(1000 * k, 100.0 - k, Sharpness(np.full(len(BANDS_PX), -((k - 40.0) ** 2) / 200.0)))
     assert track.focus().at == pytest.approx(60.0)
+
+
+def test_what_the_lens_makes_is_told_apart_from_what_more_passes_would_lessen() -> None:
+    pairs = Witness("pairs", 10.0, 0.3, 0.0, optics=0.4)
+    frames = Witness("frames", 10.0, 0.5, 0.0)
+    alone, both = fuse([pairs]), fuse([pairs, frames])
+    assert alone is not None
+    assert both is not None
+    assert (alone.sigma_um, alone.lasting_um) == (pytest.approx(0.5), pytest.approx(0.4))
+    assert both.lasting_um == pytest.approx(0.2)  # as good as each other, so half of it

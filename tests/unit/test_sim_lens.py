@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from elpd_drivers.sim.lens import LensMechanics, SimulatedLens
 from hypothesis import given
 from hypothesis import strategies as st
+
+from elpd.motion.kinematics import Piece
 
 MS = 1_000_000
 A = 640_000.0
@@ -82,6 +87,31 @@ def test_an_abrupt_stop_rings_and_dies_away() -> None:
     ramped.set_velocity(0, V, A)
     ramped.set_velocity(100 * MS, 0.0, A)
     assert at(ramped, 121) == pytest.approx(at(ramped, 300), abs=0.01)
+
+
+@given(st.lists(st.tuples(st.integers(1, 40), st.integers(-30, 30)), min_size=1, max_size=30), st.integers(1, 400))
+def test_the_swings_of_many_jumps_add_up(jumps: list[tuple[int, int]], apart_us: int) -> None:
+    mechanics = LensMechanics(backlash_um=0.0, travel_um=1e6)
+    swinging, quiet = (SimulatedLens(one, start_um=5e5) for one in (mechanics, replace(mechanics, ring_fraction=0.0)))
+    now_ns, before, made = 0, 0.0, []
+    for wait, pace in jumps:
+        now_ns += wait * apart_us * 1000
+        velocity = 400.0 * pace
+        for lens in (swinging, quiet):
+            lens.follow(now_ns, (Piece(math.inf, velocity, 0.0),))
+        made.append((now_ns, velocity - before))
+        before = velocity
+    times = np.arange(-MS, now_ns + 30 * MS, 70_000, dtype=np.int64)
+    expected = np.zeros(times.size)
+    omega = 2 * math.pi * mechanics.ring_hz
+    for at_ns, jump in made:
+        swing_um = mechanics.ring_fraction * jump * mechanics.um_per_step / omega
+        since_s = np.maximum(times - at_ns, 0) / 1e9
+        expected -= swing_um * np.sin(omega * since_s) * np.exp(-1e3 * since_s / mechanics.ring_decay_ms)
+    swing = swinging.carriage_um(times) - quiet.carriage_um(times)
+    assert swing == pytest.approx(expected, abs=1e-8)
+    alone = [float(swinging.carriage_um(times[i : i + 1])[0]) for i in range(0, times.size, 37)]
+    assert alone == swinging.carriage_um(times)[::37].tolist(), "asking often or rarely gives the same answer"
 
 
 def test_end_stops_lose_steps_silently_and_let_go_at_once() -> None:

@@ -1,5 +1,7 @@
 """Is a claimed standard error true? Errors of our own answers in units of the sigma that was claimed for them.
 
+One pass and whole cycles are told apart: the latter have crossed focus again where one pass was not enough.
+
 Sorted |error|/sigma against the quantiles of a half-normal distribution is a straight line of slope one where the
 errors are what was claimed, steeper where they are larger. Two numbers say the same: the RMS of error/sigma (one, if
 true) and the share beyond two sigma (4.6 %, if normal). Sweeps without anything to focus on have no error and are left
@@ -15,17 +17,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.methods import OURS
+from benchmarks.methods import CYCLE, OURS, rate_name
 from benchmarks.plots import Plot, Series, draw
 from benchmarks.sets import SETS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 BEYOND_TWO_SIGMA = math.erfc(2.0 / math.sqrt(2.0))
 _DRAWN = 8.0
+TITLES = {OURS: "one pass", CYCLE: "whole cycles"}
+"""Whose standard errors are asked about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +47,29 @@ class Calibration:
 
 
 def calibrations(rows: Iterable[Row]) -> list[Calibration]:
-    """Return the calibration over all sets, and of each set and frame rate, where there are answers."""
-    groups: dict[str, list[Row]] = {"all sets": []}
-    for row in rows:
-        if row.method == OURS and row.sigma_um and row.error_um is not None and not SETS[row.set_name].nothing_there:
-            groups["all sets"].append(row)
-            groups.setdefault(f"{row.set_name} {row.motion}, {row.rate}", []).append(row)
+    """Return the calibration over all sets, and of each set and frame rate, where there are answers; cycles apart."""
+    claimed = _claimed(rows)
+    groups: dict[str, list[Row]] = {}
+    for method, title in TITLES.items():
+        own = [row for row in claimed if row.method == method]
+        groups[f"{title}, all sets"] = own
+        for row in own:
+            groups.setdefault(f"{title}, {row.set_name} {row.motion}, {row.rate}", []).append(row)
     return [_calibration(name, group) for name, group in groups.items() if group]
+
+
+def _claimed(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows of ours that have an error and claim one."""
+    return [
+        row
+        for row in rows
+        if row.method in TITLES and row.sigma_um and row.error_um is not None and not SETS[row.set_name].nothing_there
+    ]
 
 
 def ratios(rows: Iterable[Row]) -> np.ndarray:
     """Return sorted |error|/sigma of our own answers (n,)."""
-    found = [
-        abs(row.error_um) / row.sigma_um
-        for row in rows
-        if row.method == OURS and row.sigma_um and row.error_um is not None and not SETS[row.set_name].nothing_there
-    ]
-    return np.sort(np.array(found, dtype=np.float64))
+    return np.sort(np.array([abs(row.error_um or 0.0) / (row.sigma_um or 1.0) for row in _claimed(rows)]))
 
 
 def half_normal_quantiles(count: int) -> np.ndarray:
@@ -68,17 +78,20 @@ def half_normal_quantiles(count: int) -> np.ndarray:
     return np.array([normal.inv_cdf(0.5 + 0.5 * (k + 0.5) / count) for k in range(count)])
 
 
-def draw_calibration(rows: Sequence[Row], title: str) -> str:
+def draw_calibration(rows: Sequence[Row], title: str, method: str = OURS) -> str:
     """Draw the quantiles of |error|/sigma against those of a half-normal distribution, a line per frame rate."""
+    own = [row for row in rows if row.method == method]
     series = [Series("as claimed", [0.0, 3.5], [0.0, 3.5])]
-    for rate in dict.fromkeys(row.rate for row in rows if row.method == OURS):
-        found = ratios(row for row in rows if row.rate == rate)
+    for rate in dict.fromkeys(row.rate for row in own):
+        found = ratios(row for row in own if row.rate == rate)
         if found.size:
             x = half_normal_quantiles(found.size)
-            series.append(Series(f"elpd, {rate} (rms {_rms(found):.2f})", x.tolist(), found.tolist()))
-    every = ratios(rows)
-    if every.size:
-        title += f": rms {_rms(every):.2f}, {(every > 2.0).mean():.1%} beyond 2"
+            series.append(Series(f"{rate_name(rate)}: {found.size}, rms {_rms(found):.2f}", x.tolist(), found.tolist()))
+    every = ratios(own)
+    if not every.size:
+        return f"<p>{title}, {TITLES[method]}: no answer claims an error.</p>"
+    told = f"{every.size} answers, rms {_rms(every):.2f}, {(every > 2.0).mean():.1%} beyond 2"
+    title = f"{title}, {TITLES[method]}: {told}"
     x_label = "what a normal error would be, in sigma"
     return draw(Plot(title, x_label, "|error| / claimed sigma", series, x_range=(0.0, 3.5), y_range=(0.0, _DRAWN)))
 

@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.limit import SignLimit
-from benchmarks.optics import FocusRenderer, load_psf
 from benchmarks.retina import Retina, RetinaEvents, joined
-from benchmarks.scenes import load_picture
+from benchmarks.scenery import Scenery
 from benchmarks.sets import APERTURE_US, FRAME_PERIODS_US, SETS, CaseSet
-from benchmarks.shake import MOTIONS, shifts_px
 from benchmarks.shutter import Shutter
 from elpd.baselines import FocusStack, LensPath, StackFrame
 from elpd.baselines.contrast import tenengrad
@@ -30,9 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-LAMP_HZ = 100.0
-"""A lamp on 50 Hz mains."""
 
 GENERATION = 5
 """Raised whenever the same name and seed would give other events, so that stale files are not used."""
@@ -154,25 +149,22 @@ def cases_of(set_name: str, seed: int, pattern: str = "*") -> list[Case]:
     return [case for case in every if case.matches(pattern)]
 
 
+def streams(case: Case) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+    """Return the case's chance, that of its motion, its sensor and its frames: a change to one leaves the others."""
+    entropy = [case.seed, zlib.crc32(case.name.encode())]
+    motion, retina, frames = (np.random.default_rng(one) for one in np.random.SeedSequence(entropy).spawn(3))
+    return motion, retina, frames
+
+
 def make(case: Case) -> SweepRecording:
     """Render and record *case*; some seconds of one core."""
     chosen = case.of_set
-    # Motion, sensor and frames have streams of their own, so that a change to one leaves the others as they were.
-    entropy = [case.seed, zlib.crc32(case.name.encode())]
-    motion_rng, retina_rng, frame_rng = (np.random.default_rng(c) for c in np.random.SeedSequence(entropy).spawn(3))
-    side = 3 * (chosen.size_px + 2 * chosen.margin_px)
-    renderer = FocusRenderer(load_picture(case.scene, side), load_psf(case.fov), chosen.margin_px)
+    motion_rng, retina_rng, frame_rng = streams(case)
+    scenery = Scenery(case, chosen.end_us, motion_rng)
     times_us = range(0, chosen.end_us + 1, chosen.step_us)
-    moved = chosen.motion_px * shifts_px(MOTIONS[case.motion], len(times_us), chosen.step_us / 1e3, motion_rng)
 
     def picture_at(t_us: int) -> NDArray[np.float32]:
-        # The area opens evenly, so the diameter, and with it the blur of a given defocus, with the square root.
-        position_um = np.sqrt(_opened(chosen, t_us)) * chosen.defocus_per_um * chosen.position_um(t_us)
-        # Before time zero, which only the first exposure sees, the scene moved as it will after it.
-        shift = np.sign(t_us) * moved[abs(t_us) // chosen.step_us]
-        lamp = np.float32(1.0 + chosen.flicker * np.sin(2.0 * np.pi * LAMP_HZ * t_us / 1e6))
-        seen = lamp * renderer.frame(position_um, (float(shift[0]), float(shift[1])))
-        return np.asarray(np.clip(seen, 0.0, 255.0), dtype=np.float32)
+        return scenery.picture(t_us, chosen.position_um(t_us), _opened(chosen, t_us))
 
     shutter = Shutter(chosen.exposure_us, chosen.read_out_us, chosen.step_us)
     for t_us in range(-shutter.reach_us, 0, chosen.step_us):

@@ -12,14 +12,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+import elpd_drivers
+
 import elpd
 from benchmarks.cases import GENERATION
 from elpd.errors import UsageError
 
 NAME = "run.json"
-_ROOMS = ("baselines", "events", "record", "vision")
+_ROOMS = ("baselines", "events", "focus", "motion", "record", "vision")
 _MAKES_ROWS = (
-    "cases", "limit", "methods", "optics", "recorded", "retina", "scenes", "sets", "shake", "shutter",
+    "cases", "cycles", "limit", "methods", "optics", "recorded", "retina", "rig", "rows", "scenery", "scenes", "sets",
+    "shake", "shutter", "starts",
 )  # fmt: skip
 
 
@@ -70,7 +73,8 @@ def code_digest() -> str:
     digest = hashlib.sha3_224()
     here, room = Path(__file__).parent, Path(elpd.__file__).parent
     own = [here / f"{name}.py" for name in _MAKES_ROWS]
-    for path in (*own, *sorted(path for one in _ROOMS for path in (room / one).rglob("*.py"))):
+    rooms = [*(room / one for one in _ROOMS), Path(elpd_drivers.__file__).parent]
+    for path in (*own, *sorted(path for one in rooms for path in one.rglob("*.py"))):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

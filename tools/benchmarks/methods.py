@@ -10,39 +10,38 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from benchmarks.sets import APERTURE_US, E2VID, MAP, REBUILT
-from elpd.baselines import PEERS, StackFrame, e2vid, reconstruction
+from benchmarks.cycles import live_through
+from benchmarks.rows import Row, row_of
+from benchmarks.sets import E2VID, MAP, REBUILT
+from benchmarks.starts import Start, start
+from elpd.baselines import PEERS, StackFrame
 from elpd.record.layouts import RecordedSweep
 from elpd.record.sweep_file import SweepSearch
 from elpd.records import Outcome
-from elpd.units import SensorUs
-from elpd.vision.first_events import FirstEventMap
-from elpd.vision.pictures import display
-from elpd.vision.reference import reference_from_frame, reference_from_temporal_image
 from elpd.vision.ruler import Ruler
-from elpd.vision.temporal_map import read_transmittance, temporal_image
 
 if TYPE_CHECKING:
     from pathlib import Path
+    from typing import Any
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from benchmarks.cases import SweepRecording
-    from elpd.records import TemporalImage
     from elpd.vision.reference import Reference
 
 OURS = "elpd"
+CYCLE = "elpd-cycle"
+"""The same in charge of the lens."""
+CYCLE_SETS = ("syn", "davis-bright", "davis-dark", "evk4-bright", "evk4-dark", "nothing", "noise")
+"""Where it is run: a recorded sweep cannot be steered, and what a lamp makes of a cycle has tests of its own."""
 NO_FRAMES = "-"
 """The frame rate of a method that sees events only."""
 _AHEAD = 0.35
 """Where in the sweep the released "1 fps" program takes its one frame: a frame from the future."""
-REBUILT_SHARE = 0.1
-"""How much of the sweep goes by before a picture made from its own events is used."""
 _CURVES_OF = (("elp-syn", "50"), ("elp-syn-1fps", "1"))
 """Only these curves are kept; the report draws some of them, and all would make the results ten times larger."""
 
@@ -57,43 +56,19 @@ class Method:
     rates: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One method on one case. ``None`` where there is no answer.
-
-    ``error_um`` is estimate less truth, ``sharpest_um`` where the picture itself is sharpest, on the same ruler,
-    ``limit_um`` how well the signs of its events could tell focus at best (``limit``), ``decided_um`` how far past
-    focus the lens was when the answer could be given, ``focusing_ms`` the time from the start of the sweep until the
-    lens could be back at the estimate, without braking.
-    """
-
-    case: str
-    seed: int
-    set_name: str
-    scene: str
-    fov: int
-    motion: str
-    method: str
-    rate: str
-    events: int
-    error_um: float | None
-    sigma_um: float | None
-    decided_um: float | None
-    focusing_ms: float | None
-    sharpest_um: float
-    limit_um: float | None
-    cpu_ms: float
-    reason: str
-    details: dict[str, Any] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain data."""
-        return asdict(self)
+def rate_name(rate: str) -> str:
+    """Return a frame rate in words."""
+    return {MAP: "temporal map", REBUILT: "rebuilt picture", E2VID: "E2VID picture", NO_FRAMES: "no frames"}.get(
+        rate, f"{rate} fps"
+    )
 
 
 def all_methods() -> dict[str, Method]:
     """Return every method by name, ours first."""
     methods = {OURS: Method(OURS, "elpd (ours)", "the past only", ("50", "20", "1", MAP, REBUILT, E2VID, NO_FRAMES))}
+    methods[CYCLE] = Method(
+        CYCLE, "elpd, a whole cycle (ours)", "the past only, steers the lens", ("50", "20", "1", MAP)
+    )
     for name, peer in PEERS.items():
         if not peer.needs_frames:
             rates: tuple[str, ...] = (NO_FRAMES,)
@@ -110,10 +85,12 @@ def all_methods() -> dict[str, Method]:
 
 def run_method(method: Method, rate: str, recording: SweepRecording, weights: Path | None = None) -> Row:
     """Run *method* on *recording* with frames at *rate*, or with the picture that it names; *weights* are E2VID's."""
+    if method.name == CYCLE:
+        return _run_cycle(recording, rate)
     begin_us = recording.case.of_set.sweep_begin_us
-    picture: _Start | None = None
+    picture: Start | None = None
     if rate in (MAP, REBUILT, E2VID):
-        picture = _start(rate, recording, weights)
+        picture = start(rate, recording, weights)
         if picture is None:
             return _no_picture(method.name, rate, recording)
         begin_us = picture.begin_us
@@ -160,50 +137,34 @@ class _HeldFrame:
         return self.pixels
 
 
-def aperture_picture(recording: SweepRecording) -> TemporalImage:
-    """Return the picture that the events of the opening aperture give."""
-    first = FirstEventMap(recording.geometry, 0, APERTURE_US)
-    stop = int(np.searchsorted(recording.t_us, APERTURE_US))
-    first.add(recording.t_us[:stop], recording.x[:stop], recording.y[:stop], recording.on[:stop])
-    return temporal_image(first.believed(), read_transmittance("linear"), SensorUs(0))
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """A picture that is there before the search begins: for our detector, as grey for the others, and from when on."""
-
-    reference: Reference
-    grey: NDArray[np.uint8]
-    begin_us: int
-
-
-def _start(rate: str, recording: SweepRecording, weights: Path | None) -> _Start | None:
-    """Return the picture named by *rate*; ``None`` where no event came to make one of."""
-    begin_us, end_us = recording.case.of_set.sweep_begin_us, recording.case.of_set.end_us
-    if rate == MAP:
-        made = aperture_picture(recording)
-        grey = display(made.log_intensity, made.valid)
-        return _Start(reference_from_temporal_image(made, recording.roi), grey, begin_us)
-    # In place of the aperture's: what the first tenth of the sweep itself lets one guess.
-    until_us = begin_us + round(REBUILT_SHARE * (end_us - begin_us))
-    first, stop = (int(place) for place in np.searchsorted(recording.t_us, (begin_us, until_us)))
-    if stop == first:
-        return None
-    events = tuple(column[first:stop] for column in (recording.t_us, recording.x, recording.y, recording.on))
-    if rate == REBUILT:
-        log = reconstruction.reconstruct(*events, recording.geometry, until_us)
-        return _Start(reference_from_frame(np.exp(log), recording.roi), display(log), until_us)
-    if weights is None:
-        raise ValueError("E2VID needs a file of weights")
-    seen = e2vid.reconstruct(e2vid.E2vid(weights), *events, recording.geometry)
-    if seen is None:
-        return None
-    return _Start(reference_from_frame(seen, recording.roi), display(seen), until_us)
-
-
 def _no_picture(name: str, rate: str, recording: SweepRecording) -> Row:
     nothing = {"focus_us": math.nan, "sigma_us": math.nan, "decided_us": math.nan, "cpu_ms": 0.0}
     return _row(recording, name, rate, **nothing, reason="no event to make a picture of", details={})
+
+
+def _run_cycle(recording: SweepRecording, rate: str) -> Row:
+    """Let the controller live through the same case; what it took of the processor is its own, not the simulation's."""
+    lived = live_through(recording.case, rate)
+    return row_of(
+        recording,
+        CYCLE,
+        rate,
+        error_um=_number(lived.error_um),
+        sigma_um=_number(lived.sigma_um),
+        decided_um=_number(lived.decided_um),
+        focusing_ms=_number(lived.focusing_ms),
+        cpu_ms=lived.cpu_ms,
+        events=lived.events,
+        again_ms=_number(lived.again_ms),
+        reason=lived.reason,
+        details={
+            "direction": lived.direction,
+            "estimate_um": lived.estimate_um,
+            "one_pass_um": lived.one_pass_um,
+            "one_pass_sigma_um": lived.one_pass_sigma_um,
+            "contributions": lived.contributions,
+        },
+    )
 
 
 def _run_ours(
@@ -275,8 +236,7 @@ def _row(
     reason: str,
     details: dict[str, Any],
 ) -> Row:
-    case = recording.case
-    chosen = case.of_set
+    chosen = recording.case.of_set
     focusing_ms = math.nan
     if math.isfinite(focus_us):
         # A decision after the sweep is taken where the sweep ended; the way back is driven at the sweep's speed.
@@ -286,27 +246,17 @@ def _row(
             focusing_ms += cpu_ms
         if "search_us" in details:
             focusing_ms = details["search_us"] / 1e3
-    return Row(
-        case=case.name,
-        seed=case.seed,
-        set_name=case.set_name,
-        scene=case.scene,
-        fov=case.fov,
-        motion=case.motion,
-        method=method,
-        rate=rate,
+    return row_of(
+        recording,
+        method,
+        rate,
+        error_um=(focus_us - recording.truth_us) * chosen.um_per_us,
+        sigma_um=sigma_us * chosen.um_per_us,
+        decided_um=(decided_us - recording.truth_us) * chosen.um_per_us if math.isfinite(focus_us) else math.nan,
+        focusing_ms=focusing_ms,
+        cpu_ms=cpu_ms,
         events=int(recording.t_us.size),
-        error_um=_or_none((focus_us - recording.truth_us) * chosen.um_per_us),
-        sigma_um=_or_none(sigma_us * chosen.um_per_us),
-        decided_um=_or_none((decided_us - recording.truth_us) * chosen.um_per_us) if math.isfinite(focus_us) else None,
-        sharpest_um=round(recording.sharpest_um, 4),
-        limit_um=_or_none(recording.sign_limit_um),
-        focusing_ms=_or_none(focusing_ms),
-        cpu_ms=round(cpu_ms, 3),
+        again_ms=math.nan,
         reason=reason,
         details=details,
     )
-
-
-def _or_none(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None

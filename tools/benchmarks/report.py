@@ -6,14 +6,14 @@ what a mean leaves out.
 
 from __future__ import annotations
 
+from collections import Counter
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.calibration import BEYOND_TWO_SIGMA, draw_calibration
-from benchmarks.goals import rate_name
-from benchmarks.methods import OURS, all_methods
-from benchmarks.plots import Plot, Series, draw
-from benchmarks.sets import MAP, REBUILT, SETS
+from benchmarks.figures import curves, errors, per_method
+from benchmarks.methods import CYCLE, OURS, all_methods
+from benchmarks.sets import SETS
 from benchmarks.verdict import MET, NOT_MET, UNMEASURED, measured
 
 if TYPE_CHECKING:
@@ -21,60 +21,48 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from benchmarks.calibration import Calibration
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
     from benchmarks.scoring import Score
     from benchmarks.sets import CaseSet
     from benchmarks.verdict import Verdict
 
-PLOTTED = (
-    (OURS, "50"),
-    (OURS, "1"),
-    (OURS, MAP),
-    (OURS, REBUILT),
-    (OURS, "-"),
-    ("elp-syn", "50"),
-    ("elp-syn-1fps", "1"),
-    ("pbf", "-"),
-    ("egs", "-"),
-    ("esva", "-"),
-)
-"""What error distributions show; no set has more than eight of them, which can still be told apart."""
-
 COLUMNS = {
     "cases": "cases",
     "MAE um": "mae_um",
+    "paper MAE": "published_um",
+    "rerun MAE": "rerun_um",
     "bias": "bias_um",
     "worst": "worst_um",
     "limit": "limit_um",
-    "to sharpest": "to_sharpest_um",
     "missed": "missed",
     "outside": "outside",
     "early": "early",
     "wrong way": "wrong_way",
-    "decided um": "decided_um",
-    "to focus ms": "focusing_ms",
-    "CPU ms": "cpu_ms",
     "rms err/σ": "spread",
     "beyond 2σ": "beyond_two",
-    "paper MAE": "published_um",
+    "to focus ms": "focusing_ms",
     "paper to focus ms": "published_focusing_ms",
+    "crossed again": "crossed_again",
+    "of it ms": "again_ms",
+    "decided um": "decided_um",
+    "to sharpest": "to_sharpest_um",
+    "CPU ms": "cpu_ms",
     "paper run ms": "published_cpu_ms",
-    "rerun MAE": "rerun_um",
 }
 COUNTS_OF_TROUBLE = ("missed", "outside", "early", "wrong_way")
 SIGNED = ("bias_um", "decided_um")
 BAD = " class='bad'"
 
-WORST_DRAWN_UM = 400.0
-
 STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; color: #111 }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1900px; padding: 0 1rem; color: #111 }
+p { max-width: 75rem }
 table { border-collapse: collapse; margin: .6rem 0 1.6rem; font-size: 13px; font-variant-numeric: tabular-nums }
 th, td { border-bottom: 1px solid #ddd; padding: .2rem .55rem; text-align: right; white-space: nowrap }
 th { background: #f4f4f4; position: sticky; top: 0 } td.word, th.word { text-align: left }
 tr.ours td { background: #eef6ff } td.bad { color: #b00020; font-weight: 600 }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem } .scroll { overflow-x: auto }
-td.so { color: #7a5c00 } td.long { white-space: normal; min-width: 24rem }
+td.so { color: #7a5c00 } td.long { white-space: normal; min-width: 15rem }
+td, th { vertical-align: top }
 svg text { font-family: system-ui, sans-serif; font-size: 13px } svg .small { font-size: 11px; fill: #333 }
 svg .title { font-weight: 600 } svg .frame { fill: none; stroke: #888 } svg .grid { stroke: #e8e8e8 }
 svg .mark { stroke: #888; stroke-dasharray: 4 3 } summary { cursor: pointer; font-weight: 600; margin: .8rem 0 }
@@ -87,7 +75,11 @@ than one depth of focus off, <b>early</b> decisions more than that before focus,
 approach for receding. Where there is nothing to focus on, every answer is outside. <b>Decided</b> is how far past
 focus the lens was when the answer could first be given as it stands, the median: a method that looks at the whole
 stack decides at its end, whatever it says about the past. <b>To focus</b> is the median time from the start of the
-sweep until the lens could be back at the estimate, without braking. <b>To sharpest</b> is the MAE against the place
+sweep until the lens could be back at the estimate, without braking. <b>elpd</b> and the peers see one recorded pass.
+<b>A whole cycle</b> is our controller in charge of the lens on the same case: the same scene, motion, lens and sensor,
+which has been looking since before the sweep; it crosses focus again where its own rule finds one pass not enough
+(<b>crossed again</b>, of <b>to focus</b> so much). Its error is where the glass rests, its time ends when focus is
+verified. <b>To sharpest</b> is the MAE against the place
 where the noise-free picture has its highest contrast: off the axis it is not where the spot is smallest, and a method
 that looks at pictures can hardly do better than their distance, unless it tells the directions of edges apart.
 <b>Limit</b> is the median standard deviation that the
@@ -125,12 +117,13 @@ def write_report(
             body.append(f"<h3>{escape(motion)}</h3>")
             body.append(_score_table([score for score in own_scores if score.motion == motion]))
         body.append("<h3>How errors are distributed</h3><div class='plots'>")
-        body.extend(_errors([row for row in own_rows if row.motion == motion], motion) for motion in motions)
-        body.append(draw_calibration(own_rows, "Is the claimed standard error true?"))
+        for motion in motions:
+            body.extend(errors([row for row in own_rows if row.motion == motion], motion))
+        body.extend(draw_calibration(own_rows, "|error|/σ", method) for method in _asked(own_rows))
         body.append(
-            f"</div>{_per_method(own_rows)}<h3>ELP as published, filtered, over the sweep</h3><div class='plots'>"
+            f"</div>{per_method(own_rows)}<h3>ELP as published, filtered, over the sweep</h3><div class='plots'>"
         )
-        body.extend(_curves(own_rows, motions))
+        body.extend(curves(own_rows, motions))
         body.append("</div>")
         body.append(_case_table(own_rows))
     page = (
@@ -143,18 +136,26 @@ def write_report(
 def _goals(goals: Sequence[Verdict]) -> str:
     """Return the table of goals: what was asked, by whom it was measured, the verdict, what others have."""
     told = (
-        "Computed from the rows of this run. “Recorded sweeps” are estimates of the causal detector; "
-        "cycles of the simulated rig, with a lens that comes to rest, are named by their file."
+        "Computed from the rows of this run. “One pass, recorded” are estimates of the causal detector, “whole cycles” "
+        "where the glass came to rest on the same cases, crossed again where the controller chose to; cycles of the "
+        "simulated rig are named by their file. An answer that was refused has no error: it is counted apart."
     )
-    heads = ("goal", "measured on", "trials", "measured", "verdict", "beside")
+    counts = Counter(one.verdict for one in goals)
+    told += " Verdicts: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.items()) + "."
+    heads = ("goal", "measured on", "verdict", "trials", "measured", "beside")
     names = "".join(f"<th class='word'>{head}</th>" for head in heads)
     lines = [f"<h2>Goals</h2><p>{told}</p><div class='scroll'><table><tr>{names}</tr>"]
+    before = ""
     for one in goals:
         kind = "word" if one.verdict in (MET, UNMEASURED) else "word bad" if one.verdict == NOT_MET else "word so"
-        words = (one.goal, one.source, f"{one.trials} of {one.wanted}", measured(one) if one.trials else "–")
-        cells = "".join(f"<td class='word'>{escape(word)}</td>" for word in words)
-        beside = f"<td class='word long'>{escape(one.beside)}</td>"
-        lines.append(f"<tr>{cells}<td class='{kind}'>{one.verdict}</td>{beside}</tr>")
+        found = measured(one) if one.trials else "–"
+        # One goal's lines stand together, and say once what it is.
+        same, before = one.goal == before, one.goal
+        lines.append(f"<tr><td class='word long'>{'' if same else escape(one.goal)}</td>")
+        lines.append(f"<td class='word'>{escape(one.source)}</td><td class='{kind}'>{one.verdict}</td>")
+        lines.append(f"<td class='word'>{one.trials} of {one.wanted}</td>")
+        lines.extend(f"<td class='word long'>{escape(word)}</td>" for word in (found, one.beside))
+        lines.append("</tr>")
     return "".join(lines) + "</table></div>"
 
 
@@ -165,7 +166,7 @@ def _calibration(rows: Sequence[Row], truth: Sequence[Calibration]) -> str:
     told = f"By set, motion and frame rate: RMS of error/σ (true: 1), share beyond 2σ (normal: {BEYOND_TWO_SIGMA:.1%})"
     lines = [
         "<h2>Is the claimed standard error true?</h2><div class='plots'>",
-        draw_calibration(rows, "All sets"),
+        *(draw_calibration(rows, "All sets", method) for method in _asked(rows)),
         f"</div><details><summary>{told}</summary><table><tr><th class='word'>answers of</th>",
         "<th>answers</th><th>rms err/σ</th><th>beyond 2σ</th></tr>",
     ]
@@ -198,7 +199,9 @@ def _overview(table: Sequence[Score], motions: Sequence[str]) -> str:
     for score in table:
         by_pair.setdefault((score.method, score.rate), {})[score.motion] = score
     for (name, rate), found in by_pair.items():
-        lines.append(f"<tr{' class=ours' if name == OURS else ''}><td class='word'>{escape(methods[name].title)}</td>")
+        lines.append(
+            f"<tr{' class=ours' if name in (OURS, CYCLE) else ''}><td class='word'>{escape(methods[name].title)}</td>"
+        )
         lines.append(f"<td class='word'>{rate}</td>")
         lines.extend(f"<td>{_overview_cell(found[one]) if one in found else ''}</td>" for one in motions)
         lines.append("</tr>")
@@ -224,7 +227,7 @@ def _score_table(table: Sequence[Score]) -> str:
         for name in COLUMNS.values():
             value = getattr(score, name)
             cells += f"<td{BAD if value and name in COUNTS_OF_TROUBLE else ''}>{_cell(value, name)}</td>"
-        lines.append(f"<tr{' class=ours' if score.method == OURS else ''}>{told}{cells}</tr>")
+        lines.append(f"<tr{' class=ours' if score.method in (OURS, CYCLE) else ''}>{told}{cells}</tr>")
     return "".join(lines) + "</table></div>"
 
 
@@ -259,79 +262,9 @@ def _case_table(rows: Sequence[Row]) -> str:
     return "".join(lines) + "</table></div></details>"
 
 
-def _errors(rows: Sequence[Row], motion: str) -> str:
-    """Draw the share of *all* cases with an error below x: lines that do not reach one have misses."""
-    series = []
-    for method, rate in PLOTTED:
-        own = [row for row in rows if (row.method, row.rate) == (method, rate)]
-        errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
-        if errors:
-            # A staircase, drawn on to the right edge at the share that had an answer at all.
-            corners = [corner for error in errors for corner in (error, error)] + [WORST_DRAWN_UM]
-            shares = [step / len(own) for k in range(len(errors)) for step in (k, k + 1)] + [len(errors) / len(own)]
-            series.append(Series(_label(method, rate), corners, shares))
-    marks = [(SETS[row.set_name].depth_of_focus_um, "depth of focus") for row in rows[:1]]
-    return draw(
-        Plot(
-            f"{motion}: share of cases below an error", "|error| um", "share of all cases", series,
-            log_x=True, x_range=(0.02, WORST_DRAWN_UM), y_range=(0.0, 1.0), marks=marks,
-        )
-    )  # fmt: skip
-
-
-def _per_method(rows: Sequence[Row]) -> str:
-    """Draw each method's signed errors, a line per motion and frame rate: the share of all its cases below x."""
-    plots = []
-    for name in dict.fromkeys(row.method for row in rows):
-        own = [row for row in rows if row.method == name]
-        series = []
-        for motion, rate in dict.fromkeys((row.motion, row.rate) for row in own):
-            group = [row for row in own if (row.motion, row.rate) == (motion, rate)]
-            errors = sorted(row.error_um for row in group if row.error_um is not None)
-            corners = [corner for error in errors for corner in (error, error)]
-            shares = [step / len(group) for k in range(len(errors)) for step in (k, k + 1)]
-            series.append(Series(f"{motion}, {rate}", corners, shares))
-        limit_um = 4.0 * SETS[own[0].set_name].depth_of_focus_um
-        title = f"{all_methods()[name].title}: signed error"
-        plots.append(
-            draw(
-                Plot(
-                    title, "error um (late is positive)", "share of cases below", series,
-                    x_range=(-limit_um, limit_um), y_range=(0.0, 1.0), marks=[(0.0, "truth")],
-                )
-            )
-        )  # fmt: skip
-    told = "Every method's signed errors; what lies further out than four depths of focus is drawn at the edge"
-    return f"<details><summary>{told}</summary><div class='plots'>{''.join(plots)}</div></details>"
-
-
-def _curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
-    """Draw the published ELP of the first case of each motion, at 50 fps and with the one future frame."""
-    plots = []
-    for motion in motions:
-        first = next(((row.case, row.seed) for row in rows if row.motion == motion and "curve" in row.details), None)
-        series, marks = [], [(0.0, "truth")]
-        for row in rows:
-            if (row.case, row.seed) != first or "curve" not in row.details:
-                continue
-            curve = row.details["curve"]
-            series.append(
-                Series(
-                    _label(row.method, row.rate),
-                    [SETS[row.set_name].position_um(t_us) for t_us in curve["t_us"]],
-                    curve["elp"],
-                )
-            )
-            if row.decided_um is not None:
-                marks.append((row.decided_um, f"decided, {_label(row.method, row.rate)}"))
-        plots.append(
-            draw(Plot("" if first is None else first[0], "lens position um", "ELP per event", series, marks=marks))
-        )
-    return plots
-
-
-def _label(method: str, rate: str) -> str:
-    return method if rate == "-" and method != OURS else f"{method}, {rate_name(rate)}"
+def _asked(rows: Sequence[Row]) -> list[str]:
+    """Return which of ours there are."""
+    return [method for method in (OURS, CYCLE) if any(row.method == method for row in rows)]
 
 
 def _number(value: float | None, *, signed: bool = False) -> str:

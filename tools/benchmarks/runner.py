@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 
 from benchmarks.cases import GENERATION, load_or_make
 from benchmarks.executors import spread
-from benchmarks.methods import NO_FRAMES, Row, all_methods, run_method
+from benchmarks.methods import CYCLE, CYCLE_SETS, NO_FRAMES, all_methods, run_method
 from benchmarks.recorded import read_recorded
+from benchmarks.rows import Row
 from benchmarks.sets import E2VID, MAP, REBUILT, SETS
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def wanted_pairs(
     known = all_methods()
     always = {MAP, REBUILT} | ({E2VID} if with_e2vid else set())
     there = [rate for rate in SETS[set_name].rates if rate in rates or rate in always]
-    return tuple((name, rate) for name in methods for rate in known[name].rates if rate == NO_FRAMES or rate in there)
+    concerned = [name for name in methods if name != CYCLE or set_name in CYCLE_SETS]
+    return tuple((name, rate) for name in concerned for rate in known[name].rates if rate == NO_FRAMES or rate in there)
 
 
 def known_rows(work: Work) -> dict[tuple[str, str], Row]:

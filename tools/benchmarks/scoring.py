@@ -17,7 +17,7 @@ from benchmarks.sets import SETS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from benchmarks.methods import Row
+    from benchmarks.rows import Row
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,8 @@ class Score:
     a depth of focus before it, ``wrong_way`` took the approach for receding. Where nothing is there to be focused on,
     every answer is outside. ``to_sharpest_um`` is the MAE against the sharpest picture. ``spread`` is the RMS of error
     over claimed sigma, honest sigmas make it one, ``beyond_two`` the share of errors beyond two sigma. ``limit_um`` is
-    the median of the cases' statistical limits to scatter (``limit``).
+    the median of the cases' statistical limits to scatter (``limit``). Of whole cycles ``crossed_again`` counts those
+    that went over focus more than once, ``again_ms`` is the median time of theirs that it took.
     """
 
     set_name: str
@@ -46,6 +47,8 @@ class Score:
     to_sharpest_um: float | None
     decided_um: float | None
     focusing_ms: float | None
+    crossed_again: int | None
+    again_ms: float | None
     cpu_ms: float
     spread: float | None
     beyond_two: float | None
@@ -77,6 +80,8 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
     focusing = np.array([row.focusing_ms for row in rows if row.focusing_ms is not None], dtype=np.float64)
     claimed = np.array([row.error_um / row.sigma_um for row in rows if row.error_um is not None and row.sigma_um])
     limits = np.array([row.limit_um for row in rows if row.limit_um is not None], dtype=np.float64)
+    lived = [row.again_ms for row in rows if row.again_ms is not None]
+    again = [one for one in lived if one > 0.0]
     apart = np.array([row.error_um - row.sharpest_um for row in rows if row.error_um is not None])
     answered = errors.size > 0
     return Score(
@@ -95,6 +100,8 @@ def _score(key: tuple[str, str, str, str], rows: Sequence[Row]) -> Score:
         to_sharpest_um=round(float(np.abs(apart).mean()), 3) if answered else None,
         decided_um=round(float(np.median(decided)), 2) if decided.size else None,
         focusing_ms=round(float(np.median(focusing)), 1) if focusing.size else None,
+        crossed_again=len(again) if lived else None,
+        again_ms=round(float(np.median(again)), 1) if again else None,
         cpu_ms=round(float(np.median([row.cpu_ms for row in rows])), 2),
         spread=round(float(np.sqrt(np.mean(claimed**2))), 3) if claimed.size else None,
         beyond_two=round(float((np.abs(claimed) > 2.0).mean()), 4) if claimed.size else None,

@@ -74,8 +74,8 @@ def tell(table: Sequence[Verdict]) -> list[str]:
     lines = []
     for one in table:
         parts = [f"{one.verdict:14s} {one.goal}"]
-        if one.trials:
-            parts.append(f"{one.source}, {one.trials} of {one.wanted}: {measured(one)}")
+        told = f", {one.trials} of {one.wanted}: {measured(one)}" if one.trials else ""
+        parts.append(f"{one.source}{told}")
         lines.append("  ".join(parts))
     return lines
 

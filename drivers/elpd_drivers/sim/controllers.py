@@ -124,13 +124,21 @@ def controller(name: str) -> Controller:
 
 
 def fitted(
-    name: str, lens: SimulatedLens, wanted: Wanted, clock: Clock, *, seed: int, adapter_ns: int = 0
+    name: str,
+    lens: SimulatedLens,
+    wanted: Wanted,
+    clock: Clock,
+    *,
+    seed: int,
+    adapter_ns: int = 0,
+    own: Mapping[str, Any] | None = None,
 ) -> tuple[MemoryPort, Table]:
     """Power the board up in front of *lens*, homed, behind a line in memory; return it and its driver's table.
 
-    An adapter passes on what it is sent *adapter_ns* later.
+    An adapter passes on what it is sent *adapter_ns* later; *own* are config keys in which this board is not like
+    others of its kind.
     """
     chosen = controller(name)
-    config = chosen.board.config(referenced=True, **chosen.setup(wanted))
+    config = chosen.board.config(referenced=True, **chosen.setup(wanted), **(own or {}))
     board = chosen.board.make(lens, config, seed=seed, begin_ns=clock.now_ns())
     return MemoryPort(board, clock, latency_ns=adapter_ns), chosen.table(wanted)

@@ -16,6 +16,7 @@ Positions of pulses and rotor are in microsteps from the lower limit switch, the
 
 from __future__ import annotations
 
+import cmath
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -113,8 +114,7 @@ class SimulatedLens:
         self._history_ns = round(history_s * NS_PER_S)
         self._stuck = False
         self._stretches = [_Stretch(-FOR_EVER_NS, FOR_EVER_NS, start, 0.0, 0.0, start, start, follows=True)]
-        self._rings: list[tuple[int, float]] = []
-        self._columns: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
+        self._rings: list[tuple[int, complex]] = []
 
     # --- what boards command ---------------------------------------------------------------------------------------
 
@@ -177,7 +177,6 @@ class SimulatedLens:
                 velocity_before = v + a * dt
                 _, rotor, carriage = self._state(end_ns)
                 begin_ns = end_ns
-        self._columns = None
         self.advance(at_ns)
 
     def advance(self, until_ns: int) -> None:
@@ -189,7 +188,6 @@ class SimulatedLens:
         if stale > 64:
             del self._stretches[:stale]
             self._rings = [ring for ring in self._rings if ring[0] > horizon]
-            self._columns = None
 
     # --- what boards may know --------------------------------------------------------------------------------------
 
@@ -265,7 +263,6 @@ class SimulatedLens:
         rest = [s for s in self._stretches if s.begin_ns > at_ns]
         for before, after in zip([stretch, *rest], rest, strict=False):
             _, after.rotor, after.carriage = self._within(before, after.begin_ns)
-        self._columns = None
 
     # --- below: how it is done -------------------------------------------------------------------------------------
 
@@ -293,7 +290,15 @@ class SimulatedLens:
         mechanics = self.mechanics
         swing_um = mechanics.ring_fraction * jump_sps * mechanics.um_per_step / (2 * math.pi * mechanics.ring_hz)
         if abs(swing_um) > 1e-3:
-            self._rings.append((at_ns, -swing_um))
+            so_far = 0j
+            if self._rings:
+                before_ns, phasor = self._rings[-1]
+                so_far = phasor * cmath.exp(self._swinging() * ((at_ns - before_ns) / NS_PER_S))
+            self._rings.append((at_ns, so_far - swing_um))
+
+    def _swinging(self) -> complex:
+        """Return what a swing's phasor is multiplied by in a second is the exponential of."""
+        return complex(-1e3 / self.mechanics.ring_decay_ms, 2 * math.pi * self.mechanics.ring_hz)
 
     def _at(self, when_ns: int) -> _Stretch:
         index = bisect_right(self._stretches, when_ns, key=_begin) - 1
@@ -313,15 +318,17 @@ class SimulatedLens:
         self, times_ns: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return times, pulses, rotor and carriage (all in steps); the vector form of ``_within``."""
-        if self._columns is None:
-            begins = np.array([s.begin_ns for s in self._stretches], dtype=np.int64)
-            rows = [
-                (s.pulses, s.velocity_sps, s.acceleration_sps2, s.rotor, s.carriage, float(s.follows))
-                for s in self._stretches
-            ]
-            self._columns = begins, np.array(rows, dtype=np.float64)
-        begins, table = self._columns
         times = np.asarray(times_ns, dtype=np.int64)
+        if not times.size:
+            return times, np.zeros(times.shape), np.zeros(times.shape), np.zeros(times.shape)
+        first = max(bisect_right(self._stretches, int(times.min()), key=_begin) - 1, 0)
+        last = max(bisect_right(self._stretches, int(times.max()), key=_begin), 1)
+        stretches = self._stretches[first:last]
+        begins = np.array([s.begin_ns for s in stretches], dtype=np.int64)
+        rows = [
+            (s.pulses, s.velocity_sps, s.acceleration_sps2, s.rotor, s.carriage, float(s.follows)) for s in stretches
+        ]
+        table = np.array(rows, dtype=np.float64)
         index = np.maximum(np.searchsorted(begins, times, side="right") - 1, 0)
         row = table[index]
         dt = (times - begins[index]) / NS_PER_S
@@ -334,19 +341,25 @@ class SimulatedLens:
         return times, row[..., 0] + gone, rotor, carriage
 
     def _ringing_um(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
-        decay_s = self.mechanics.ring_decay_ms / 1e3
-        omega = 2 * math.pi * self.mechanics.ring_hz
-        earliest, latest = int(times.min(initial=FOR_EVER_NS)), int(times.max(initial=-FOR_EVER_NS))
-        total = np.zeros(times.shape)
-        for begin_ns, swing_um in self._rings:
-            if begin_ns < latest and begin_ns > earliest - round(12 * decay_s * NS_PER_S):
-                dt = np.maximum((times - begin_ns) / NS_PER_S, 0.0)
-                total += swing_um * np.sin(omega * dt) * np.exp(-dt / decay_s)
-        return total
+        """Return the swing at *times*: of all jumps so far, which from the newest on decay as one."""
+        first = max(bisect_right(self._rings, int(times.min()), key=_first) - 1, 0)
+        rings = self._rings[first : bisect_right(self._rings, int(times.max()), key=_first)]
+        if not rings:
+            return np.zeros(times.shape)
+        begins = np.array([at_ns for at_ns, _ in rings], dtype=np.int64)
+        phasors = np.array([phasor for _, phasor in rings], dtype=np.complex128)
+        index = np.searchsorted(begins, times, side="right") - 1
+        dt = np.maximum((times - begins[index]) / NS_PER_S, 0.0)
+        swing: NDArray[np.float64] = (phasors[index] * np.exp(self._swinging() * dt)).imag
+        return np.where(index < 0, 0.0, swing)
 
 
 def _begin(stretch: _Stretch) -> int:
     return stretch.begin_ns
+
+
+def _first(ring: tuple[int, complex]) -> int:
+    return ring[0]
 
 
 def _piece(stretch: _Stretch, begin_ns: int, end_ns: int) -> Piece:
