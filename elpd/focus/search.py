@@ -162,7 +162,7 @@ class Search:
                 self.reversals += 1
                 raise Beside(Outcome.NO_CROSSING, "focus seemed to lie behind both ways")
             if self.reversals >= self._settings.max_reversals:
-                if lit and dark and show_change(frames):
+                if lit and not watch.lit and dark and show_change(frames):  # a lamp makes events, if not of focus
                     raise Ended(
                         Outcome.TOO_FEW_EVENTS,
                         "the frames show the picture change as the lens goes, but the events do not stand above noise; "
