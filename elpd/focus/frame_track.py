@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.track import RISE, FrameEnergy, PeakTrack
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from elpd.records import Frame, Roi
     from elpd.units import SensorUs
     from elpd.vision.track import Sharpness
+
+SIGMAS_OF_CHANGE = 3.0
+"""Beyond chance in one of seven hundred cycles that find no focus either way."""
 
 
 class FrameTrack:
@@ -33,3 +41,21 @@ class FrameTrack:
         """Whether the newest frame is the sharpest, by more than noise could make it."""
         track = self._track
         return len(track) > 1 and track.drop == 0.0 and track.rise > RISE
+
+
+def show_change(passes: Iterable[FrameTrack]) -> bool:
+    """Say whether what frames show changes as the lens goes: that of a lens that stands still does not.
+
+    Sharpness that changes is alike in neighbours, noise is not: von Neumann's ratio (Ann. Math. Stat. 12, 1941), the
+    sum of squared successive differences over that of deviations from the mean, is 2 for n independent values, with
+    a standard deviation of 2/sqrt(n) at the most.
+    """
+    steps = spread = 0.0
+    count = 0
+    for one in passes:
+        values = np.array([sharpness.bands[0] for _, sharpness in one.seen])
+        if values.size:
+            steps += float(np.square(np.diff(values)).sum())
+            spread += float(np.square(values - values.mean()).sum())
+            count += values.size
+    return spread > 0.0 and steps / spread < 2.0 - SIGMAS_OF_CHANGE * 2.0 / sqrt(count)

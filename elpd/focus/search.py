@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 from elpd.focus import safety
 from elpd.focus.ended import Beside, Ended, ended_by
 from elpd.focus.expose import AFTER_FACTOR
+from elpd.focus.frame_track import show_change
 from elpd.focus.stage import REST_LIMIT_MS
 from elpd.focus.sweep import Sweep, SweepEnd, SweepPlan, SweepReport
 from elpd.motion.braking import braking_from
@@ -16,6 +17,7 @@ from elpd.units import NS_PER_S, HostNs
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from elpd.focus.frame_track import FrameTrack
     from elpd.focus.settings import CycleSettings
     from elpd.focus.stage import Stage
     from elpd.focus.watch import Watch
@@ -116,7 +118,8 @@ class Search:
         reach_um = self._settings.max_travel_um
         turned_at_um: float | None = None
         trodden_um = 0.0
-        lit, dark = watch.lit or self._shown, True
+        lit, dark, ruled = watch.lit or self._shown, True, True
+        frames: list[FrameTrack] = []
         while True:
             self._stage.listener = self._stage.interrupt = None  # a sweep asks for itself, and stops the lens first
             self.sign = sign
@@ -152,13 +155,20 @@ class Search:
                     lit, reach_um = True, reach_um - abs(self._stage.here_um() - report.begun_um)
                     continue  # far from focus a lens may go a long way before anything changes
                 raise ended_by(report.verdict)
-            dark = dark and report.end is SweepEnd.RULE and report.dark
+            dark, ruled = dark and report.dark, ruled and report.end is SweepEnd.RULE
+            frames.append(watch.frames)
             once_more = self.reversals < self._settings.max_reversals and not self._from_aside
             if report.end is SweepEnd.BEHIND and turned_at_um is not None and once_more:
                 self.reversals += 1
                 raise Beside(Outcome.NO_CROSSING, "focus seemed to lie behind both ways")
             if self.reversals >= self._settings.max_reversals:
-                if lit and dark:
+                if lit and not watch.lit and dark and show_change(frames):  # a lamp makes events, if not of focus
+                    raise Ended(
+                        Outcome.TOO_FEW_EVENTS,
+                        "the frames show the picture change as the lens goes, but the events do not stand above noise; "
+                        "it is too dark for them: add light, or lower the sensor's thresholds",
+                    )
+                if lit and dark and ruled:
                     raise Ended(
                         Outcome.LENS_DID_NOT_MOVE,
                         "nothing changed while the lens should have moved, and yet the scene is in the light "

@@ -63,7 +63,7 @@ class SweepReport:
     stop: CommandStamp | None
     begun_um: float
     dark: bool = False
-    """Whether nothing stood above noise when a rule ended it."""
+    """Whether nothing stood above noise when it ended without having passed focus."""
 
 
 class Sweep:
@@ -112,7 +112,8 @@ class Sweep:
                     return SweepReport(SweepEnd.PASSED, safety.Verdict(safety.Action.CONTINUE), stop, begun_um)
                 self._show(samples)
                 if watch.direction is Direction.RECEDING:
-                    return SweepReport(SweepEnd.BEHIND, safety.Verdict(safety.Action.CONTINUE), None, begun_um)
+                    dark = safety.is_dark(self._conditions(plan, begun_ns, begun_um, heard_ns, reported_from))
+                    return SweepReport(SweepEnd.BEHIND, safety.Verdict(safety.Action.CONTINUE), None, begun_um, dark)
             conditions = self._conditions(plan, begun_ns, begun_um, heard_ns, reported_from)
             verdict = safety.decide(conditions)
             if verdict.outcome is Outcome.TOO_FEW_EVENTS and watch.sees_a_scene:

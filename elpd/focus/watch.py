@@ -203,6 +203,11 @@ class Watch:
         return order(self._hearing.memory.change()) > SIGMAS_OF_MOTION
 
     @property
+    def frames(self) -> FrameTrack:
+        """The frames of this direction of travel."""
+        return self._under_way.frames
+
+    @property
     def passed(self) -> bool:
         """Whether focus has certainly been passed."""
         return self._under_way.passed

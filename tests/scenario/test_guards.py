@@ -167,3 +167,17 @@ def test_a_sensor_that_counts_what_it_drops_is_believed(seed: int) -> None:
 )
 def test_motion_that_looks_like_focusing_is_never_taken_for_it(seed: int, motion: tuple[str, ...]) -> None:
     meet(seed, *motion)  # the invariants hold: FOCUSED within a depth of focus, or not at all
+
+
+@pytest.mark.parametrize("seed", [5001, 5002])
+def test_where_events_are_noise_and_frames_show_the_lens_move_it_is_too_dark_and_not_stuck(seed: int) -> None:
+    keys = ("sim.camera=davis346", "sim.brightness=0.0005", "sim.noise_hz=0.005")
+    story = meet(seed, *keys)
+    assert story.outcome is Outcome.TOO_FEW_EVENTS
+    assert story.result is not None
+    assert "too dark" in story.result.reason
+
+    def stick(story: Story) -> None:
+        story.truth.mechanism.stick(story.parts.clock.now_ns())
+
+    assert meet(seed, *keys, events=(Event("choose", 0.0, stick),)).outcome is not Outcome.TOO_FEW_EVENTS
