@@ -323,8 +323,8 @@ class FocusEstimate:
     """Where focus is, on the ruler the caller used (um of lens travel), with one standard deviation.
 
     ``method`` is one of ``pairs``, ``crossing``, ``two_crossings``; ``contributions`` holds every estimator that had a
-    say: ``(name, focus_um, sigma_um, weight)``. ``lasting_um`` is the part of the standard deviation that is the same in
-    every pass, because the lens makes it.
+    say: ``(name, focus_um, sigma_um, weight)``. ``lasting_um`` is the part of the standard deviation that is the same
+    in every pass, because the lens makes it.
     """
 
     focus_um: float

@@ -6,9 +6,11 @@ Only the path goes to stdout. The signals that end it are waited for, not handle
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import tomllib
+from contextlib import suppress
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, cast
 
@@ -40,6 +42,8 @@ def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *,
     served = find_board(board)
     # a shell's background jobs ignore SIGINT; this one must not
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    with suppress(PermissionError):  # what it plays does not wait for whoever is busy on this machine
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     # blocked before the serving thread exists, so that it inherits the mask and this thread gets the signal
     signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:

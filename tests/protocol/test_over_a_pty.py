@@ -6,6 +6,7 @@ in real time; nothing is asserted about how long it took.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -45,6 +46,18 @@ def on_a_pty(request: pytest.FixtureRequest) -> Rig:
     return made
 
 
+def marked_as_exclusive(path: str) -> bool:
+    """Say whether who does not ask for the lock is kept out too; root is not, and sees the mark."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    except OSError as error:
+        return error.errno == errno.EBUSY
+    try:
+        return fcntl.ioctl(descriptor, TIOCGEXCL, bytes(4)) != bytes(4)
+    finally:
+        os.close(descriptor)
+
+
 def opened(made: Rig) -> Any:
     assert isinstance(made.port, PtyPort)
     table = {"port": made.port.path, **made.dialect.homed}
@@ -68,6 +81,8 @@ def test_a_port_in_use_is_refused_with_clear_words_and_nothing_moves(on_a_pty: R
     with pytest.raises(BusyError, match="in use by another program"):
         opened(on_a_pty)
     assert on_a_pty.rotor == 3200.0
+    assert isinstance(on_a_pty.port, PtyPort)
+    assert marked_as_exclusive(on_a_pty.port.path)
     first.close()
     opened(on_a_pty).close()
 
@@ -102,7 +117,7 @@ def tic_board() -> Iterator[tuple[PtyServer, Any]]:
 def test_a_program_that_was_killed_keeps_nobody_from_the_port(tic_board: Any) -> None:
     server, _ = tic_board
 
-    def marked_as_exclusive(descriptor: int) -> bool:
+    def marked(descriptor: int) -> bool:
         return fcntl.ioctl(descriptor, TIOCGEXCL, bytes(4)) != bytes(4)
 
     watching = os.open(server.port, os.O_RDWR | os.O_NOCTTY)
@@ -111,12 +126,12 @@ def test_a_program_that_was_killed_keeps_nobody_from_the_port(tic_board: Any) ->
         fcntl.flock(killed, fcntl.LOCK_EX)
         fcntl.ioctl(killed, termios.TIOCEXCL)
         CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 300))
-        assert marked_as_exclusive(watching)  # as long as it lives the mark is respected
+        assert marked(watching)  # as long as it lives the mark is respected
         os.close(killed)  # as the kernel does it: nobody takes the mark back
         end = after_ms(CLOCK.now_ns(), 20_000)
-        while marked_as_exclusive(watching) and CLOCK.now_ns() < end:
+        while marked(watching) and CLOCK.now_ns() < end:
             CLOCK.sleep_until(after_ms(CLOCK.now_ns(), 10))
-        assert not marked_as_exclusive(watching)
+        assert not marked(watching)
     finally:
         os.close(watching)
 

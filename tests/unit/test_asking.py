@@ -54,6 +54,23 @@ def test_a_pause_in_which_nobody_looked_is_no_silence_of_the_controller() -> Non
         look_on(asking, range(3030, 3060))
 
 
+def test_after_a_question_that_was_asked_twice_the_second_answer_has_time_to_come() -> None:
+    asked_once, asked_twice = Asking(4.0, 50.0), Asking(4.0, 50.0)
+    for asking in (asked_once, asked_twice):
+        asking.check(0, "")
+        asking.asked(0)
+        look_on(asking, range(1, 14))
+    asked_twice.asked_again()
+    asked_twice.asked(13 * MS)
+    for asking in (asked_once, asked_twice):
+        asking.answered()
+        asking.believed()
+    assert asked_once.due(18 * MS)
+    assert asked_twice.pausing(18 * MS)
+    assert not asked_twice.due(18 * MS)
+    assert asked_twice.due(60 * MS)
+
+
 def test_a_question_waits_for_twice_what_answers_take() -> None:
     asking = Asking(4.0, 50.0)
     converse(asking, 11.0, 200)

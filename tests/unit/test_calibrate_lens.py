@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import Answer, caller
+from elpd_drivers.sim.boards import avr
 from lens_rigs import KINDS, SPEED_SPS, UM_PER_STEP, Rig, open_rig, rig
 from structlog.testing import capture_logs
 
@@ -97,7 +98,7 @@ def bench(made: Rig, repeats: int = 2) -> LensBench:
     return LensBench(made.clock, made.lens, LensScale(UM_PER_STEP), speed_um_s=SPEED_UM_S, repeats=repeats)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "avr"])  # its firmware is emulated: minutes
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_measured_stop_is_the_next_one_that_comes(kind: str) -> None:
     made = open_rig(kind)
     if not made.lens.capabilities.stop_on_command:
@@ -257,6 +258,34 @@ def test_the_command_measures_stores_and_draws(elpd: Callable[..., Answer], tmp_
     damaged = tmp_path / "state" / "lens.json"
     damaged.write_text(damaged.read_text()[:200])
     assert elpd("home", "--foreground", *STATE, "--json").json["error"]["kind"] == "FormatError"
+
+
+SET_SPS2 = 1_280_000.0
+
+
+@pytest.mark.parametrize(
+    ("board", "onset_ms"), [("avr", 0.2), ("grbl", 45.0), ("scf4", 0.3), ("tmcl", 1.2), ("zaber", 1.7)]
+)
+def test_the_command_measures_the_stops_of_every_board(
+    elpd: Callable[..., Answer], tmp_path: Path, board: str, onset_ms: float
+) -> None:
+    if board == "avr" and avr.hindrance() is not None:
+        pytest.skip(str(avr.hindrance()))
+    answer = elpd(
+        *("calibrate", "lens", "--repeats", "2", "--json", "--plot", "lens.png", *STATE),
+        *("--set", f"sim.board={board}", "--set", "sim.seed=91"),
+    )
+    assert answer.code == 0, answer.err
+    found = answer.json["stopping"]
+    stop = found["abrupt"] or found["ramped"]
+    onset = stop["onset_ms"] if stop["set_ramp_onset_ms"]["value"] is None else stop["set_ramp_onset_ms"]
+    assert onset["value"] == pytest.approx(onset_ms, abs=4 * onset["sigma"] + 0.1 * onset_ms)
+    braking = found["ramped"]["deceleration_sps2"]
+    assert braking["value"] is None or abs(braking["value"] - SET_SPS2) < 4 * braking["sigma"]
+    lost = found["lost_steps"]
+    assert abs(lost["value"]) < 3 * lost["sigma"]
+    assert (tmp_path / "state" / "lens.json").exists()
+    assert cv2.imread(str(tmp_path / "lens.png")).std() > 20
 
 
 def test_a_measured_table_is_the_ruler_unless_the_configuration_has_one(

@@ -421,9 +421,13 @@ class DirectLens:
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Around everything that can meet trouble: the halt goes out, the fault stays, the reference is gone."""
-        with self._line.stopping_on_trouble(lambda: self._controller.trouble_bytes, "halt"):
+        with self._line.stopping_on_trouble(self._strongest, "halt"):
             try:
                 yield
             except Trouble:
                 self._motor.referenced = False
                 raise
+
+    def _strongest(self) -> bytes:
+        """Return what ends a motion that is in trouble; one that ignores stops has its driver switched off."""
+        return self._controller.trouble_bytes + (self._controller.last_resort if self._motor.runs_on else b"")

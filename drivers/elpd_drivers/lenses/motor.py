@@ -58,6 +58,8 @@ class Motor:
         self.newest_command = 0
         self.stops = 0
         self.stops_ignored = 0
+        self.runs_on = False
+        """Whether it was seen to run where a stop should have brought it to rest: more than a stop is needed."""
         self.written_ns = 0
         """How long the host took to write what is in force: a busy machine may have held it up before it left."""
         self._grace_ns = round(grace_ms * NS_PER_MS)
@@ -65,6 +67,7 @@ class Motor:
         self._trajectory = Trajectory(timing, floor_steps=floor_steps)
         self._lock = threading.Lock()
         self._implausible = self._resumed = 0
+        self._stopping = False
 
     # --- where it is -----------------------------------------------------------------------------------------------
 
@@ -108,6 +111,7 @@ class Motor:
         with self._lock:
             self.newest_command = self._trajectory.command(motion, effective_ns, sigma_ns)
             self._resumed = 0
+            self._stopping = motion.target_steps is None and not motion.velocity_sps
             self._expect_rest(effective_ns, sigma_ns, grace_ms)
             return self.newest_command
 
@@ -176,6 +180,12 @@ class Motor:
                 self._expect_rest(report.latest_ns, 0.0, None)
                 return True
         self._implausible += 1
+        if self._implausible >= CONFIRMATIONS and self._stopping and report.moving:
+            self.runs_on = True
+            raise Trouble(
+                f"the motor still runs after a stop, {surprise.steps:+.0f} steps from where it must rest (limit "
+                f"{limit:.0f}); switch the controller off and on, look at its cable, then home it"
+            )
         if self._implausible >= CONFIRMATIONS:
             raise Trouble(
                 f"the controller reports a position {surprise.steps:+.0f} steps from where it must be "

@@ -187,7 +187,7 @@ class SimulatedLens:
             stale += 1
         if stale > 64:
             del self._stretches[:stale]
-            self._rings = [ring for ring in self._rings if ring[0] > horizon]
+            del self._rings[: bisect_right(self._rings, horizon, key=_first)]
 
     # --- what boards may know --------------------------------------------------------------------------------------
 

@@ -66,6 +66,10 @@ class TmclConfig:
     ignore_stop: bool = False
 
 
+MAX_CURRENT = 6
+"""The axis parameter."""
+
+
 class TmclBoard:
     """A simulated TMCL module. See ``boards.line.SimulatedBoard`` for the three methods that a wire calls.
 
@@ -349,6 +353,8 @@ class TmclBoard:
             self._target = value
         elif kind == 2:
             self._run(value, at_ns)
+        elif kind == MAX_CURRENT:
+            (self.lens.release if value else self.lens.stick)(at_ns)  # without a current no field holds the rotor
         elif kind in {4, 5} and not self._velocity_mode and self._axis.search is Search.NO:
             self._go(at_ns)
         return value
