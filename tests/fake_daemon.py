@@ -13,6 +13,7 @@ import contextlib
 import json
 import math
 import os
+import socket
 import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Self
@@ -57,26 +58,32 @@ class FakeDaemon:
         self.holder: dict[str, Any] | None = None
         """Who has the lease; the gateway runs in this process."""
         self._listeners: dict[asyncio.StreamWriter, int] = {}
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._server: asyncio.Server | None = None
+        self._listening: socket.socket | None = None
+        self._served: dict[asyncio.Task[None], socket.socket] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self.changed = asyncio.Condition()
 
     async def start(self) -> Self:
         """Listen."""
         self.path.unlink(missing_ok=True)
-        self._server = await asyncio.start_unix_server(self._serve, self.path)
+        self._listening = socket.socket(socket.AF_UNIX)
+        self._listening.setblocking(False)
+        self._listening.bind(str(self.path))
+        self._listening.listen()
+        asyncio.get_running_loop().add_reader(self._listening, self._accept)
         return self
 
     async def stop(self) -> None:
-        """Go away as a killed process does: every connection ends, the socket is gone."""
-        assert self._server is not None
-        self._server.close()
-        for writer in list(self._writers):
-            writer.transport.abort()
-        for task in list(self._tasks):
+        """Go away as a killed process does: every connection ends, a new one as well; the socket is gone."""
+        assert self._listening is not None
+        asyncio.get_running_loop().remove_reader(self._listening)
+        self._listening.close()
+        served = dict(self._served)
+        for task in [*served, *self._tasks]:
             task.cancel()
-        await self._server.wait_closed()
+        await asyncio.gather(*served, return_exceptions=True)
+        for connection in served.values():
+            connection.close()
         self.path.unlink(missing_ok=True)
 
     async def until(self, true: Callable[[], bool]) -> None:
@@ -161,8 +168,19 @@ class FakeDaemon:
 
     # --- the socket --------------------------------------------------------------------------------------------
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._writers.add(writer)
+    def _accept(self) -> None:
+        assert self._listening is not None
+        try:
+            connection, _ = self._listening.accept()
+        except BlockingIOError:
+            return  # whoever it was is gone again
+        connection.setblocking(False)
+        task = asyncio.create_task(self._serve(connection))
+        self._served[task] = connection
+        task.add_done_callback(self._served.pop)
+
+    async def _serve(self, connection: socket.socket) -> None:
+        reader, writer = await asyncio.open_unix_connection(sock=connection)
         try:
             while line := await reader.readline():
                 request = json.loads(line)
@@ -172,9 +190,8 @@ class FakeDaemon:
         except OSError:
             pass
         finally:
-            self._writers.discard(writer)
             self._listeners.pop(writer, None)
-            writer.close()
+            writer.transport.abort()
 
     async def _answer(self, request: dict[str, Any], writer: asyncio.StreamWriter) -> None:
         method = request["method"]

@@ -252,8 +252,10 @@ def _case_table(rows: Sequence[Row]) -> str:
         lines.append(f"<tr><td class='word'>{escape(case)}</td><td>{seed}</td><td>{any_row.events}</td>")
         lines.append(f"<td>{_number(any_row.limit_um)}</td>")
         for pair in pairs:
-            row = found[pair]
-            if row.error_um is None:
+            row = found.get(pair)
+            if row is None:
+                lines.append("<td></td>")
+            elif row.error_um is None:
                 lines.append(f"<td title='{escape(row.reason, quote=True)}'>/</td>")
             else:
                 bad = BAD if abs(row.error_um) > SETS[row.set_name].depth_of_focus_um else ""
