@@ -25,6 +25,7 @@ from elpd.focus.passes import Play
 from elpd.focus.scene import Scene, check_roi, widened
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
+from elpd.focus.undisturbed import undisturbed
 from elpd.focus.watch import Watch
 from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
@@ -124,6 +125,7 @@ class FocusCycle:
             return None
         return self._watch.after.sharpest(self._estimate.focus_um, depths * self._settings.depth_of_focus_um)
 
+    @undisturbed()
     def run(self) -> FocusResult:
         """Run the cycle to its one result.
 
