@@ -1,8 +1,8 @@
 /* Steps: ramps, limits, the step counter and its time.
  *
  * Timer 1 runs freely at 2 MHz: compare A makes the steps, and its 16 bits, looked at once a millisecond at least, are
- * the clock of every stamp. The ramp is the one of D. Austin, "Generate stepper-motor speed profiles in real time" (Embedded Systems
- * Programming, 2005): with n the number of steps that a ramp from rest has taken, the next interval is
+ * the clock of every stamp. The ramp is the one of D. Austin, "Generate stepper-motor speed profiles in real time"
+ * (Embedded Systems Programming, 2005): with n the number of steps that a ramp from rest has taken, the next interval is
  *
  *     c[n] = c[n-1] - 2 c[n-1] / (4 n + 1),      c[0] = 0.676 f sqrt(2 / a),
  *

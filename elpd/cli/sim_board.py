@@ -6,7 +6,6 @@ Only the path goes to stdout. The signals that end it are waited for, not handle
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import sys
@@ -20,6 +19,7 @@ import click
 from elpd.cli.common import config_options, json_option, print_json
 from elpd.config import Config, load
 from elpd.errors import UsageError
+from elpd.undisturbed import undisturbed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,6 +33,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 @click.argument("board")
 @config_options
 @json_option
+@undisturbed()  # to look through the hundred thousand objects of a lens's history holds replies up by 50 ms and more
 def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
     """Serve a simulated BOARD (grbl, tic, tmcl, zaber, ...) on a pty until interrupted.
 
@@ -45,8 +46,6 @@ def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *,
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(PermissionError):  # what it plays does not wait for whoever is busy on this machine
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    # a lens's history is a hundred thousand objects; looking through all of them holds a reply up by 50 ms and more
-    gc.disable()
     # blocked before the serving thread exists, so that it inherits the mask and this thread gets the signal
     signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
@@ -63,7 +62,6 @@ def command(board: str, config_path: Path | None, overrides: tuple[str, ...], *,
             running.close()
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
-        gc.enable()
 
 
 def find_board(name: str) -> Board:

@@ -25,7 +25,6 @@ from elpd.focus.passes import Play
 from elpd.focus.scene import Scene, check_roi, widened
 from elpd.focus.search import Search
 from elpd.focus.stage import REST_LIMIT_MS, Stage
-from elpd.focus.undisturbed import undisturbed
 from elpd.focus.watch import Watch
 from elpd.ports import Biases, HardwareRoi, PixelMask
 from elpd.records import (
@@ -39,6 +38,7 @@ from elpd.records import (
     Roi,
     StopMode,
 )
+from elpd.undisturbed import undisturbed
 from elpd.units import NS_PER_MS, HostNs, after_ms
 from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.reference import reference_from_frame

@@ -120,10 +120,10 @@ def pass_again(
     """Go over focus again until it is known or there is no more time: back, and then there and back.
 
     Returns what all passes say and the furthest place, um, in the sweep's direction; *furthest_um* is how far the sweep
-    went, from where the lens may be on its way back by now. In a still scene a doubtful answer
-    may come of several depths; more passes would only make their mixture look certain. So they are believed only if
-    they tell that the region is flat (``vision.relief``), or if one of them has seen the scene move, which a hand that
-    turned round in the first did not show; else the answer stays as it was.
+    went, from where the lens may be on its way back by now. In a still scene a doubtful answer may come of several
+    depths; more passes would only make their mixture look certain. So they are believed only if they tell that the
+    region is flat (``vision.relief``), or if one of them has seen the scene move, which a hand that turned round in the
+    first did not show; else the answer stays as it was.
 
     The way is bounded: a few times the reach, the ramps and the play; its time is the caller's phase ``recross``. The
     lens is left on the side that the sweep came from.

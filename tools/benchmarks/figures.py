@@ -38,10 +38,9 @@ def _distribution(rows: Sequence[Row], pairs: Sequence[tuple[str, str]], title: 
         own = [row for row in rows if (row.method, row.rate) == (method, rate)]
         errors = sorted(max(abs(row.error_um), 0.02) for row in own if row.error_um is not None)
         if errors:
-            # A staircase, drawn on to the right edge at the share that had an answer at all.
-            corners = [corner for error in errors for corner in (error, error)] + [WORST_DRAWN_UM]
-            shares = [step / len(own) for k in range(len(errors)) for step in (k, k + 1)] + [len(errors) / len(own)]
-            series.append(Series(_label(method, rate), corners, shares))
+            corners, shares = _staircase(errors, len(own))
+            # Drawn on to the right edge at the share that had an answer at all.
+            series.append(Series(_label(method, rate), [*corners, WORST_DRAWN_UM], [*shares, shares[-1]]))
     marks = [(SETS[row.set_name].depth_of_focus_um, "depth of focus") for row in rows[:1]]
     return draw(
         Plot(
@@ -60,9 +59,7 @@ def per_method(rows: Sequence[Row]) -> str:
         for motion, rate in dict.fromkeys((row.motion, row.rate) for row in own):
             group = [row for row in own if (row.motion, row.rate) == (motion, rate)]
             errors = sorted(row.error_um for row in group if row.error_um is not None)
-            corners = [corner for error in errors for corner in (error, error)]
-            shares = [step / len(group) for k in range(len(errors)) for step in (k, k + 1)]
-            series.append(Series(f"{motion}, {rate}", corners, shares))
+            series.append(Series(f"{motion}, {rate}", *_staircase(errors, len(group))))
         limit_um = 4.0 * SETS[own[0].set_name].depth_of_focus_um
         title = f"{all_methods()[name].title}: signed error"
         plots.append(
@@ -100,6 +97,12 @@ def curves(rows: Sequence[Row], motions: Sequence[str]) -> list[str]:
             draw(Plot("" if first is None else first[0], "lens position um", "ELP per event", series, marks=marks))
         )
     return plots
+
+
+def _staircase(errors: Sequence[float], cases: int) -> tuple[list[float], list[float]]:
+    """Return the corners of a distribution of sorted errors, and the share of all cases at each."""
+    corners = [corner for error in errors for corner in (error, error)]
+    return corners, [step / cases for k in range(len(errors)) for step in (k, k + 1)]
 
 
 def _label(method: str, rate: str) -> str:

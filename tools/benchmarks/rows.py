@@ -52,17 +52,17 @@ def row_of(
     method: str,
     rate: str,
     *,
-    error_um: float,
-    sigma_um: float,
-    decided_um: float,
-    focusing_ms: float,
+    error_um: float | None,
+    sigma_um: float | None,
+    decided_um: float | None,
+    focusing_ms: float | None,
     cpu_ms: float,
     events: int,
-    again_ms: float,
+    again_ms: float | None,
     reason: str,
     details: dict[str, Any],
 ) -> Row:
-    """Return a row from numbers of which ``nan`` says that there is none."""
+    """Return a row from numbers of which ``None`` or ``nan`` says that there is none."""
     case = recording.case
     return Row(
         case=case.name,
@@ -87,5 +87,5 @@ def row_of(
     )
 
 
-def _or_none(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
+def _or_none(value: float | None) -> float | None:
+    return round(value, 4) if value is not None and math.isfinite(value) else None

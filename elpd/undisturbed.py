@@ -1,4 +1,4 @@
-"""A cycle in which the interpreter does not stop to look for garbage."""
+"""Work in which the interpreter does not stop to look for garbage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def undisturbed() -> Iterator[None]:
     """Put collections of garbage off until the end; also a decorator.
 
     Each stops every thread until all objects have been looked at: 80 ms in a program that did not freeze what it began
-    with, in which a lens at 4 mm/s goes 0.3 mm. A cycle leaves some tens of megabytes behind at the most.
+    with, in which a lens at 4 mm/s goes 0.3 mm. A focus cycle leaves some tens of megabytes behind at the most.
     """
     put_off = gc.isenabled()
     gc.disable()
