@@ -24,6 +24,7 @@ export function mountPicture(store) {
   let known; // the daemon's region; undefined: not asked yet
   let told; // the region in the status before
   let sent = 0; // changes of this page's; an answer to an older one than the last says nothing of the region
+  let overtaken = []; // regions of this page's own that a late status may still tell of
   let named = {};
   let wasLive = false;
   let lastResult = null;
@@ -102,6 +103,7 @@ export function mountPicture(store) {
 
   function takeRegions(answer, asked) {
     if (asked === sent) {
+      overtaken.push(known);
       known = answer.roi;
       editor.set(known);
     }
@@ -161,7 +163,9 @@ export function mountPicture(store) {
     show($("kind-frame"), Boolean(state.status?.camera.has_frames));
     const region = state.status?.roi;
     const news = told === undefined ? sent === 0 : !same(region, told);
-    if (region !== undefined && known !== undefined && news && !same(region, known)) {
+    const late = overtaken.some((one) => one !== undefined && same(one, region));
+    if (region !== undefined && known !== undefined && same(region, known)) overtaken = [];
+    else if (region !== undefined && known !== undefined && news && !late) {
       known = region; // somebody else set it; a status that is late says what it said before
       editor.set(known);
     }
