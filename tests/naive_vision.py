@@ -62,22 +62,31 @@ def mirror_pairs(t_us: Any, x: Any, y: Any, on: Any, position: Any) -> Any:
 
 
 def knots(events: Any) -> Any:
-    """Return the (position, level) knots of one pixel's events [(position, on)], levels joined linearly."""
+    """Return the (position, level) knots of one pixel's events [(position, step)], levels joined linearly."""
     points = [(-float("inf"), 0.0)]
     level = 0.0
-    for k, (here, on) in enumerate(events):
-        step = 1.0 if on else -1.0
+    for k, (here, step) in enumerate(events):
         if k == 0:
             points.append((here, level))  # constant up to the first event, then it has been crossed
-        elif events[k - 1][1] != on:
+        elif events[k - 1][1] * step < 0:
             last = events[k - 1][0]
             mirrored = (last + here) / 2
-            if k >= 2 and events[k - 2][1] == events[k - 1][1]:
+            if k >= 2 and events[k - 2][1] * events[k - 1][1] > 0:
                 mirrored = max(here - (last - events[k - 2][0]), mirrored)
             points.append((mirrored, level))
         level += step
         points.append((here, level))
     return points
+
+
+def steps_with_losses(events: Any, deaf_us: Any, most: Any) -> Any:
+    """Return how far the level of one pixel went with each of its events [(time, on)]."""
+    lost = [0.0]
+    for (before, was_on), (now, on) in pairwise(events):
+        heard = max(now - before - deaf_us, deaf_us / most)
+        lost.append(deaf_us / heard if on == was_on and deaf_us > 0 else 0.0)
+    lost.append(0.0)
+    return [(1.0 if on else -1.0) * (1.0 + 0.5 * (lost[k] + lost[k + 1])) for k, (_, on) in enumerate(events)]
 
 
 def level_at(events: Any, tick: Any) -> Any:

@@ -166,7 +166,8 @@ def _refractory(moving: list[Columns], good: np.ndarray, geometry: Geometry, evi
         return Quantity.none(evidence.why_not("sweeps", "no sweep was recorded"), "us")
     most = max(moving, key=lambda events: events.t_us.size)
     keep = good[most.y, most.x]
-    found = refractory_period(most.t_us[keep], most.x[keep], most.y[keep], (geometry.height, geometry.width))
+    columns = (most.t_us[keep], most.x[keep], most.y[keep], most.on[keep])
+    found = refractory_period(*columns, (geometry.height, geometry.width))
     if found.sigma_us == 0.0 or found.period_us < 2.0 * found.sigma_us:
         return Quantity.none(
             "no interval between two events of a pixel comes near it: the shortest tell of the scene, not of the pixel"

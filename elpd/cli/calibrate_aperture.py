@@ -159,7 +159,8 @@ def _recorded(path: Path, span: tuple[int, int] | None) -> tuple[Geometry, list[
 def _deafness(events: Columns, geometry: Geometry) -> float:
     from elpd.vision.refractory import refractory_period  # noqa: PLC0415
 
-    return refractory_period(events.t_us, events.x, events.y, (geometry.height, geometry.width)).period_us
+    shape = (geometry.height, geometry.width)
+    return refractory_period(events.t_us, events.x, events.y, events.on, shape).period_us
 
 
 def _tell(found: ApertureCalibration) -> None:

@@ -204,7 +204,6 @@ class Aftermath:
             settings.speed_um_s,
             WIDTHS_PER_DEPTH_OF_FOCUS * settings.depth_of_focus_um,
             self.scene_moves,
-            self._passes.deaf,
         )
         if hearing.lamp is not None:
             said = one.testify_under_a_lamp(self._locate, hearing.window_us)

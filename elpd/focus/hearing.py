@@ -193,7 +193,10 @@ class Hearing:
         to focus, and when the scene moves the difference of two sharp pictures is sharpest anywhere.
         """
         hot, sensor, support_us = self.resting.hot, self._sensor, self._support_us
-        self.memory = EventMemory(self.roi, self._geometry, hot=hot, sensor=sensor, start=start, support_us=support_us)
+        deafness = self.resting.deafness
+        self.memory = EventMemory(
+            self.roi, self._geometry, hot=hot, sensor=sensor, start=start, support_us=support_us, deafness=deafness
+        )
         if self.lamp is not None:
             self.memory.under_a_lamp()
 

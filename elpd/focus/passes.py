@@ -93,8 +93,6 @@ class Pass:
     width_um: float
     """The width that the curve of log S has in this optical system."""
     scene_moves: bool
-    deaf: Refractory | None = None
-    """How long pixels are deaf after an event, where another pass has said so: an error is then the same in both."""
 
     def testify(
         self, locate: Callable[[SensorUs], float], brightness: NDArray[np.float32], unexplained: float, dark: float
@@ -110,9 +108,9 @@ class Pass:
             return Testimony(tuple(self.ask_frames(locate)))
         if self.end_us > memory.track.times_us[-1]:
             memory.advance(self.end_us, self.sign * locate(self.end_us))
-        deaf = memory.refractory() if self.deaf is None else self.deaf
+        deaf = memory.refractory()
         ruler = lens_path(locate, self.begun_us, self.end_us, self.sign)
-        said = memory.ask(memory.track.times_us[-1], ruler, brightness, deaf.period_us, dark=dark)
+        said = memory.ask(memory.track.times_us[-1], ruler, brightness, deaf, dark=dark)
         if said is None:
             return Testimony(tuple(self.ask_frames(locate)), deaf=deaf)
         undated_um = 1e-6 * self.speed_um_s * deaf.sigma_us
@@ -121,7 +119,7 @@ class Pass:
         if self.scene_moves or (not said.depths and said.drift.seen):
             return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True)
         witnesses = [
-            replace(one, shared=float(np.hypot(one.shared, undated_um)))
+            replace(one, shared=float(np.hypot(one.shared, undated_um)), dated_per_us=1e-6 * self.speed_um_s)
             for one in said.witnesses(unexplained, self.width_um)
         ]
         seen = [] if said.depths or frames is None else [frames.witness]  # of several planes frames show a mixture
@@ -140,7 +138,8 @@ class Pass:
         tilt = (VERTEX_IN_MOTION + VERTEX_PER_PX * said.drift.px) / sqrt(said.drift.isotropy)
         strayed_um = tilt * said.image.finest.width**2 / self.width_um
         late = vertex.with_lag(lag.at, float(np.hypot(lag.sigma, undated_um)))
-        return [replace(late, sigma=float(np.hypot(vertex.sigma, strayed_um)))]
+        sigma = float(np.hypot(vertex.sigma, strayed_um))
+        return [replace(late, sigma=sigma, dated_per_us=1e-6 * self.speed_um_s)]
 
     def testify_under_a_lamp(self, locate: Callable[[SensorUs], float], window_us: float) -> Testimony:
         """Ask the curve of whole lamp periods, one point each *window_us*, and the frames."""
@@ -209,7 +208,7 @@ class Passes:
         self.scene_moves = False
         """Whether any of them saw the scene move."""
         self.deaf: Refractory | None = None
-        """How long pixels are deaf after an event, by the first of them."""
+        """How long pixels are deaf after an event, by all that they have sent so far."""
         self.begin_um = 0.0
         """How far before focus most pairs begin, as far as has been seen."""
         self.flat: bool | None = None
@@ -226,7 +225,7 @@ class Passes:
         self.flicker = said.flicker or self.flicker
         if said.scene_moves or self._moved_between():
             self.take_for_moving()
-        self.deaf = self.deaf or said.deaf
+        self.deaf = said.deaf or self.deaf
         self.begin_um = max(self.begin_um, said.begin_um)
         self.flat = None if self.scene_moves or self.depths_um else self._told_flat(flat_within_um)
 
@@ -269,6 +268,8 @@ class Passes:
         if len(self._said) < 2:
             return said
         evened = []
+        # The longer events are listened to, the better it is known how long pixels are deaf.
+        said = [(one if self.deaf is None else one.if_deaf_for(self.deaf), sign) for one, sign in said]
         for one, sign in said:
             alike = [other for other, _ in said if other.name == one.name]
             freed, shared = (float(np.mean([getattr(other, key) for other in alike])) for key in ("freed", "shared"))

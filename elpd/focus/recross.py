@@ -82,13 +82,13 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
 
 
 def _pays(first: FocusEstimate, settings: CycleSettings) -> bool:
-    """Say whether the mean of two passes would have less than half the variance of a still scene's first answer.
+    """Say whether the mean of two passes would be better known than a still scene's first answer.
 
     It knows all but half the play, of which the bound is taken even if it was measured: what is good enough without
     another pass stays so. What the lens has of its own is in both.
     """
     half_play_um = 0.5 * Play.up_to(settings.backlash_um).sigma_um
-    return first.sigma_um**2 - first.lasting_um**2 > 2.0 * half_play_um**2
+    return first.sigma_um**2 - first.lasting_um**2 > half_play_um**2
 
 
 def _certain(estimate: FocusEstimate | None, settings: CycleSettings) -> bool:

@@ -104,6 +104,17 @@ class Unrest:
 
     per_px: float
     per_root_ms: float
+    longest_ms: float = float("inf")
+    """How long it was listened to."""
+
+    def moved(self, gone_px: NDArray[np.float64], took_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what motion may have done to log S.
+
+        What it leaves behind has forgotten where the scene was once that has gone by as much as the band is wide. And
+        motion that goes on as it did does no more than in all the time that it was listened to.
+        """
+        gone = self.per_px * np.minimum(gone_px, BAND_PX)
+        return np.maximum(gone, self.per_root_ms * np.sqrt(np.clip(took_ms, 0.0, self.longest_ms)))
 
     @classmethod
     def of(cls, stills: Iterable[tuple[int, NDArray[np.float32]]], margin: int) -> Unrest | None:
@@ -119,6 +130,7 @@ class Unrest:
         return cls(
             float(np.sqrt(squares / max(gone, LEAST_SHIFT_PX**2 * before.size))),
             float(np.sqrt(np.mean(np.square(change[:, 1]) / change[:, 0]))),
+            float(change[:, 0].max()),
         )
 
 
@@ -155,9 +167,7 @@ class Bearing:
         now = self._gauge.look(image if self._beneath is None else image + self._beneath, t_us)
         if self._seen:
             took_ms, change, x_px, y_px, variance = (np.array(now) - np.array(self._seen)).T
-            motion = np.maximum(
-                self._unrest.per_px * np.hypot(x_px, y_px), self._unrest.per_root_ms * np.sqrt(np.maximum(took_ms, 0.0))
-            )
+            motion = self._unrest.moved(np.hypot(x_px, y_px), took_ms)
             limit = self._doubt * np.hypot(TIMES_MOTION * motion, SIGMAS_OF_EVENTS * np.sqrt(variance))
             beyond = np.abs(change) > limit
             if beyond.any():

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from elpd.vision.lag import LagPrior
+    from elpd.vision.rebuilt import Groups
 
 STILL = 0.1
 """Share of stray pairs up to which a scene counts as still: a pixel's silence then says that it has not come back. In
@@ -59,6 +60,9 @@ SAMPLE_PX = 1 << 15
 only has to confirm them, and so many pixels are enough for that."""
 
 ROI_MARGIN_PX = 14
+
+NO_FOCUS_HEARD = 0.2
+"""How far, in widths, losses that were put back may have moved a focus that is not there without them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +165,9 @@ def ask_events(
         turning = who_turns(at_peak, at_peak - 0.5 * (images[0] + images[-1]), light.weight)
     lag, expected = _lag_of_image(light, energy, turning, late, unmeasured_lag, calibrated)
     image, drift = _sharpest(images, ticks, peak, events, light, still=stray_share(pairs) < STILL)
+    put_back = 0.0
+    if drift.seen and image is not None:
+        put_back = _put_back(image, events, groups, ticks, peak, light)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     pairs_lag = late.typical
     if drift.seen:
@@ -180,7 +187,25 @@ def ask_events(
         turns=late.turns,
         in_focus=light.focused,
         pairs_lag=pairs_lag.at,
+        deaf=events.deaf,
+        put_back=put_back,
     )
+
+
+def _put_back(
+    image: BandFocus,
+    events: EventStretch,
+    groups: Groups,
+    ticks: NDArray[np.float64],
+    peak: float,
+    light: _Light,
+) -> float:
+    """Return how far focus went because what pixels lost while deaf was put back into the image of a moving scene."""
+    if events.deaf.period_us <= 0.0:
+        return 0.0
+    heard = rebuilt(events.as_heard(), groups, ticks)
+    as_heard, _ = _sharpest(heard, ticks, peak, events, light, still=False)
+    return NO_FOCUS_HEARD * image.finest.width if as_heard is None else image.at - as_heard.at
 
 
 def _sharpest(

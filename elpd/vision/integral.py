@@ -106,11 +106,11 @@ def stamp_events(
                 target[column] += sign * source[column]
 
 
-@kernel("void(int64[::1], float64[::1], uint8[::1], float64[::1], float32[:, ::1])")
+@kernel("void(int64[::1], float64[::1], float64[::1], float64[::1], float32[:, ::1])")
 def rebuild_levels(
     starts: NDArray[np.int64],
     position: NDArray[np.float64],
-    on: NDArray[np.uint8],
+    steps: NDArray[np.float64],
     ticks: NDArray[np.float64],
     level: NDArray[np.float32],
 ) -> None:
@@ -120,8 +120,9 @@ def rebuild_levels(
     ----------
     starts:
         Events of pixel ``k``, in time order, are ``starts[k] : starts[k + 1]``.
-    position, on:
-        Lens position (rising with time) and polarity of each event, grouped by pixel (``group_by_pixel``).
+    position, steps:
+        Lens position (rising with time) of each event, and how far the level went with it (positive for an ON event, in
+        thresholds: one, or more by ``losses.steps_with_losses``), grouped by pixel (``group_by_pixel``).
     ticks:
         Positions at which the levels are wanted, rising.
     level:
@@ -136,17 +137,17 @@ def rebuild_levels(
         at = -1e300  # where the last knot lies; before the first event the level is constant
         for i in range(begin, end):
             here = position[i]
-            step = 1.0 if on[i] else -1.0
+            step = steps[i]
             if i == begin:
                 while tick < n_ticks and ticks[tick] < here:
                     level[tick, k] = value
                     tick += 1
             else:
                 last = position[i - 1]
-                if on[i - 1] != on[i]:
+                if steps[i - 1] * step < 0.0:
                     # The turn: the level of the last event is met again on the way back.
                     mirrored = 0.5 * (last + here)
-                    if i - 2 >= begin and on[i - 2] == on[i - 1]:
+                    if i - 2 >= begin and steps[i - 2] * steps[i - 1] > 0.0:
                         mirrored = max(here - (last - position[i - 2]), mirrored)
                     at = mirrored
                 else:

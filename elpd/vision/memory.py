@@ -20,9 +20,10 @@ from elpd.vision.filters import PixelCap
 from elpd.vision.flicker import find_flicker
 from elpd.vision.integral import BANDS_PX, band_gain, stamp_events
 from elpd.vision.lag import UNMEASURED_LAG_US, LagPrior
+from elpd.vision.losses import lost_levels
 from elpd.vision.planes import FLANK
 from elpd.vision.rebuilt import EventStretch
-from elpd.vision.refractory import Refractory, refractory_period
+from elpd.vision.refractory import NOT_DEAF, Deafness, Refractory
 from elpd.vision.slowness import DARK
 from elpd.vision.track import POINT, EventEnergy, PeakTrack
 
@@ -60,6 +61,8 @@ class BuiltImage:
     levels: NDArray[np.float32]
     events: int
     """How many they were."""
+    lost: NDArray[np.float32] | None = None
+    """What the image lacks because pixels were deaf, (height, width); ``None`` where nobody asked."""
 
 
 class EventMemory:
@@ -79,6 +82,8 @@ class EventMemory:
         The image that earlier events have built, upon which these go on building.
     support_us:
         Events that no other pixel of their cell fired so shortly before are not heard; 0: all are.
+    deafness:
+        What earlier events of this region have taught of how long its pixels are deaf. These go on teaching it.
     """
 
     def __init__(
@@ -90,6 +95,7 @@ class EventMemory:
         sensor: SensorProfile | None = None,
         start: BuiltImage | None = None,
         support_us: int = 0,
+        deafness: Deafness | None = None,
     ) -> None:
         self._left, self._top = max(0, roi.x - ROI_MARGIN_PX), max(0, roi.y - ROI_MARGIN_PX)
         self._right = min(geometry.width, roi.x + roi.width + ROI_MARGIN_PX)
@@ -106,6 +112,8 @@ class EventMemory:
         self._start = start
         self._energy = EventEnergy(height, width, ROI_MARGIN_PX, None if start is None else start.levels)
         self._shape = (height, width)
+        self.deafness = Deafness(self._shape) if deafness is None else deafness
+        self._taught = 0
         self._columns = _columns(FIRST_CAPACITY)
         self._count = 0
         self._taken = 0
@@ -154,7 +162,7 @@ class EventMemory:
         part = slice(self._taken, self._count)
         _, x, y, on = self._columns
         stamp_events(x[part], y[part], on[part], POINT, levels)
-        return BuiltImage(levels, self._forgotten + self._count)
+        return BuiltImage(levels, self._forgotten + self._count, self._lost(self._count))
 
     def sharpest(self) -> NDArray[np.float32]:
         """Return the image at the peak of the curve, (height, width) in thresholds."""
@@ -180,6 +188,7 @@ class EventMemory:
         self._columns = columns
         self._count -= drop
         self._taken -= drop
+        self._taught = max(0, self._taught - drop)
         self._forgotten += drop
 
     def cut(self, image: NDArray[Any]) -> NDArray[Any]:
@@ -218,9 +227,11 @@ class EventMemory:
         return times
 
     def refractory(self) -> Refractory:
-        """Return how long a pixel is deaf after an event, as far as the events up to the last ``advance`` tell."""
-        t_us, x, y, _ = (column[: self._taken] for column in self._columns)
-        return refractory_period(t_us, x, y, self._shape)
+        """Return how long a pixel is deaf after an event, by the events up to the last ``advance`` and earlier ones."""
+        part = slice(self._taught, max(self._taken, self._taught))
+        self.deafness.add(*(column[part] for column in self._columns))
+        self._taught = part.stop
+        return self.deafness.period()
 
     def flicker(self) -> Flicker | None:
         """Return a lamp's flicker, if the events up to the last ``advance`` show one."""
@@ -272,7 +283,7 @@ class EventMemory:
         now_us: int,
         ruler: Ruler,
         brightness: NDArray[np.float32] | None = None,
-        deaf_us: float = 0.0,
+        deaf: Refractory = NOT_DEAF,
         start: NDArray[np.float32] | None = None,
         dark: float = DARK,
         *,
@@ -281,7 +292,8 @@ class EventMemory:
         """Question the events of the present stretch of motion up to the last ``advance``.
 
         *brightness* is that of the whole sensor (``Reference.brightness``), *dark* the dark current that it does not
-        show; events are dated *deaf_us* later, to the release of their pixels. *start* is the picture, as brightness,
+        show; events are dated later by what pixels are *deaf*, to their release, and what they lost meanwhile is put
+        back. *start* is the picture, as brightness,
         that the sensor saw when it sent the first of them; *hurried* says that a lens waits for the answer.
         ``None`` when there is nothing to ask.
         Positions in the answer rise with time: they are multiplied by the sign of the motion.
@@ -296,11 +308,12 @@ class EventMemory:
         if peak_us <= flank_us:
             return None
         part = slice(begin, self._taken)
-        position = sign * ruler.at(self._t_us[part] + round(deaf_us))
+        position = sign * ruler.at(self._t_us[part] + round(deaf.period_us))
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
         base = None if self._start is None else self._upon(self._start, begin)
-        events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base)
+        lost = None if self._start is None else self._lost(begin)
+        events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base, lost, deaf)
         if begin > 0 or self._forgotten:
             start = None
         flank, peak, now = (sign * ruler.position(one) for one in (flank_us, peak_us, now_us))
@@ -324,6 +337,12 @@ class EventMemory:
         stamp_events(x, y, on, POINT, levels)
         return levels
 
+    def _lost(self, count: int) -> NDArray[np.float32]:
+        """Return what the image that the first *count* events have left lacks because pixels were deaf."""
+        t_us, x, y, on = (column[:count] for column in self._columns)
+        lost = lost_levels(t_us, x, y, on, self.refractory().period_us, self._shape)
+        return lost if self._start is None or self._start.lost is None else lost + self._start.lost
+
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Return the part of a picture of the whole sensor that belongs to the events that are kept."""
         if picture is None:
@@ -343,7 +362,7 @@ class EventMemory:
         if lamp is not None:
             # What makes pairs of bright pixels differ from those of dark ones is the lamp then, not the lag.
             brightness = start = None
-        said = self.ask(now_us, ruler, brightness, deaf.period_us, start, hurried=False)
+        said = self.ask(now_us, ruler, brightness, deaf, start, hurried=False)
         self.depths = ()
         if said is None or (said.image is None and not said.depths):
             return [], None

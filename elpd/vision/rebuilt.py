@@ -6,12 +6,14 @@ images are asked for is in ``elpd.vision.crossing``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elpd.vision.integral import group_by_pixel, rebuild_levels
+from elpd.vision.losses import steps_with_losses
+from elpd.vision.refractory import NOT_DEAF, Refractory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 class EventStretch:
     """Events of a region and its margin, in coordinates of that cut-out, with rising lens positions.
 
-    ``base``, (height, width), is the image in thresholds that earlier events had built; ``None`` for nothing.
+    ``base``, (height, width), is the image in thresholds that earlier events had built, ``None`` for nothing, and
+    ``base_lost`` what it lacks because pixels were deaf. ``deaf`` is for how long they are.
     """
 
     t_us: NDArray[np.int64]
@@ -36,6 +39,12 @@ class EventStretch:
     width: int
     margin: int
     base: NDArray[np.float32] | None = None
+    base_lost: NDArray[np.float32] | None = None
+    deaf: Refractory = NOT_DEAF
+
+    def as_heard(self) -> EventStretch:
+        """Return the same as if no pixel was ever deaf, and nothing lost."""
+        return replace(self, base_lost=None, deaf=NOT_DEAF)
 
 
 def by_pixel(events: EventStretch) -> Groups:
@@ -47,10 +56,14 @@ def rebuilt(events: EventStretch, groups: Groups, ticks: NDArray[np.float64]) ->
     """Return the image at each tick, (ticks, height, width), in thresholds."""
     level = np.empty((ticks.size, events.height * events.width), dtype=np.float32)
     starts, order = groups
-    rebuild_levels(starts, events.position[order], events.on[order], ticks, level)
+    steps = np.empty(order.size)
+    steps_with_losses(starts, events.t_us[order], events.on[order], events.deaf.period_us, steps)
+    rebuild_levels(starts, events.position[order], steps, ticks, level)
     images = level.reshape(ticks.size, events.height, events.width)
     if events.base is not None:
         images += events.base
+    if events.base_lost is not None:
+        images += events.base_lost
     return images
 
 
@@ -65,16 +78,16 @@ def busiest_rows(events: EventStretch, pixels: int) -> slice:
 def rows_of(events: EventStretch, rows: slice) -> EventStretch:
     """Return the events of some rows, in coordinates of those."""
     inside = (events.y >= rows.start) & (events.y < rows.stop)
-    return EventStretch(
-        events.t_us[inside],
-        events.x[inside],
-        (events.y[inside] - rows.start).astype(np.uint16),
-        events.on[inside],
-        events.position[inside],
-        rows.stop - rows.start,
-        events.width,
-        events.margin,
-        None if events.base is None else events.base[rows],
+    return replace(
+        events,
+        t_us=events.t_us[inside],
+        x=events.x[inside],
+        y=(events.y[inside] - rows.start).astype(np.uint16),
+        on=events.on[inside],
+        position=events.position[inside],
+        height=rows.stop - rows.start,
+        base=None if events.base is None else events.base[rows],
+        base_lost=None if events.base_lost is None else events.base_lost[rows],
     )
 
 

@@ -10,6 +10,7 @@ measured.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,9 @@ from elpd.vision.crossing import ROI_MARGIN_PX
 from elpd.vision.detector import RestingRate
 from elpd.vision.flicker import find_flicker, residue
 from elpd.vision.integral import band_energy, band_gain, band_patch, inside_margin
+from elpd.vision.losses import lost_levels
 from elpd.vision.memory import BuiltImage
+from elpd.vision.refractory import Deafness
 from elpd.vision.track import frame_levels
 from elpd.vision.whole_periods import WholePeriods
 
@@ -80,6 +83,11 @@ class Resting:
         self._inside = _box(roi, geometry, 0)
         self.heard = _box(roi, geometry, ROI_MARGIN_PX)
         """The region and its margin, as pixels of the sensor."""
+        rows, columns = np.flatnonzero(self.heard.any(axis=1)), np.flatnonzero(self.heard.any(axis=0))
+        self._corner = int(columns[0]), int(rows[0])
+        self._size = rows.size, columns.size
+        self.deafness = Deafness(self._size)
+        """What the region's pixels have taught of how long they are deaf after an event."""
         self._pieces: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]]] = []
         self._count = 0
         self._frame: Frame | None = None
@@ -186,17 +194,21 @@ class Resting:
 
     def _look_for_motion(self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8]) -> None:
         levels = self._levels(pixel, on)
+        x, y = self._places(pixel)
+        self.deafness.add(t_us, x, y, on)
         found = order(levels)
         self.moves = found > SIGMAS_OF_MOTION
         if found <= SIGMAS_OF_SUSPICION:
             if self._frame is None and self._picture is not None:
                 self.only_picture = self._cut(self._picture())
             return
-        built, before = BuiltImage(levels, t_us.size), None
+        lost = partial(lost_levels, deaf_us=self.deafness.period().period_us, shape=self._size)
+        built, before = BuiltImage(levels, t_us.size, lost(t_us, x, y, on)), None
         if self._frame is not None:
             since = t_us >= self._frame.t_us
             now = self._cut(frame_levels(self._frame.pixels)) + self._levels(pixel[since], on[since])
-            built, before = BuiltImage(now, int(since.sum())), now - levels
+            built = BuiltImage(now, int(since.sum()), lost(t_us[since], x[since], y[since], on[since]))
+            before = now - levels
         elif self._picture is not None:  # in the middle of the rest it lies where events are best explained
             picture = self._cut(self._picture())
             before = self.beneath = laid_on(picture, levels) - np.float32(0.5) * levels
@@ -223,8 +235,13 @@ class Resting:
         return self._cut(net.astype(np.float32))
 
     def _cut(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        rows, columns = np.flatnonzero(self.heard.any(axis=1)), np.flatnonzero(self.heard.any(axis=0))
-        return np.ascontiguousarray(image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+        (left, top), (height, width) = self._corner, self._size
+        return np.ascontiguousarray(image[top : top + height, left : left + width])
+
+    def _places(self, pixel: NDArray[np.int64]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+        """Return where pixels of the sensor lie in the region and its margin, (x, y)."""
+        (left, top), width = self._corner, self._geometry.width
+        return (pixel % width - left).astype(np.uint16), (pixel // width - top).astype(np.uint16)
 
     def _net_of_periods(
         self, t_us: NDArray[np.int64], pixel: NDArray[np.int64], on: NDArray[np.uint8], period_us: float

@@ -19,6 +19,7 @@ from elpd.records import FocusEstimate
 from elpd.vision.drift import Drift
 from elpd.vision.lag import Lag
 from elpd.vision.planes import MIN_PAIRS
+from elpd.vision.refractory import NOT_DEAF, Refractory
 from elpd.vision.relief import halves_apart
 
 if TYPE_CHECKING:
@@ -53,6 +54,9 @@ PAIRS_DEPART = 2.0
 LAG_UNEXPLAINED = 1.0
 """How much of the lag that was corrected may be wrong: the picture that told bright from dark was blurred itself,
 which hides most of the difference."""
+
+LOSSES_UNEXPLAINED = 0.3
+"""Share of what was put back of a deaf pixel's losses that may be wrong: the level does not go on evenly."""
 
 SYSTEMATIC_UNDER_A_LAMP = 0.09
 """The systematic error of the curve of whole lamp periods, which is not rebuilt: late by 0.03 widths on the average."""
@@ -89,11 +93,20 @@ class Witness:
     """What it is in a region that is known to be flat: how far apart halves of it put their modes."""
     optics: float = 0.0
     """What a lens does to one side of focus and not to the other: the same in every pass, so no mean makes it less."""
+    lost: float = 0.0
+    """What is not known of what pixels lost while they were deaf, with its sign."""
+    lost_per_us: float = 0.0
+    """How far ``at`` would go if pixels were deaf for a microsecond longer, because more was lost."""
+    dated_per_us: float = 0.0
+    """The same because events would be dated later; what is not known of that is in ``shared``."""
+    deaf_us: float = 0.0
+    """How long pixels were taken to be deaf."""
 
     @property
     def total_sigma(self) -> float:
         """All errors together."""
-        return float(np.linalg.norm([self.sigma, self.shared, self.held, self.play, self.astray, self.optics]))
+        common = (self.shared, self.held, self.play, self.optics, self.lost)
+        return float(np.linalg.norm([self.sigma, self.astray, *common]))
 
     def on_the_way_back(self, play: float, play_sigma: float) -> Witness:
         """Return what a pass in the opposite direction said, on the ruler of the sweep.
@@ -101,8 +114,22 @@ class Witness:
         What was late lies to the other side there, and the carriage is behind the motor by the *play*.
         """
         return replace(
-            self, at=play - self.at, shared=-self.shared, held=-self.held, play=play_sigma, freed=-self.freed
+            self,
+            at=play - self.at,
+            shared=-self.shared,
+            held=-self.held,
+            play=play_sigma,
+            freed=-self.freed,
+            lost=-self.lost,
+            lost_per_us=-self.lost_per_us,
+            dated_per_us=-self.dated_per_us,
         )
+
+    def if_deaf_for(self, deaf: Refractory) -> Witness:
+        """Return the same as if pixels had been taken to be deaf for as long as has been learnt since."""
+        doubt_us = float(np.hypot(deaf.sigma_us, LOSSES_UNEXPLAINED * deaf.period_us))
+        at = self.at + (self.lost_per_us + self.dated_per_us) * (deaf.period_us - self.deaf_us)
+        return replace(self, at=at, deaf_us=deaf.period_us, lost=self.lost_per_us * doubt_us)
 
     def with_lag(self, freed: float, shared: float) -> Witness:
         """Return the same as if another lag had been taken off, which is known to *shared*."""
@@ -131,6 +158,10 @@ class EventWitnesses:
     """What the image would have been freed of if no pair had been asked."""
     pairs_lag: float = 0.0
     """What the pairs were freed of: they need not be of the pixels that the image shows."""
+    deaf: Refractory = NOT_DEAF
+    """How long pixels were taken to be deaf."""
+    put_back: float = 0.0
+    """How far the image's focus went because what they lost meanwhile was put back."""
     turns: Turns | None = None
     """The pairs themselves, as they were asked."""
     in_focus: bool = False
@@ -159,6 +190,7 @@ class EventWitnesses:
                     astray=stray_share(self.pairs) * width,
                     apart=0.0 if self.turns is None else halves_apart(self.turns),
                     optics=_optics_of_pairs(self.turns, width),
+                    deaf_us=self.deaf.period_us,
                 )
             )
         return found
@@ -170,7 +202,12 @@ class EventWitnesses:
         dull = (1.0 + HELD_BACK * self.held_back) * (self.image.finest.width if width is None else width)
         sigma = float(np.hypot(self.image.sigma, IMAGE_IN_MOTION * stray_share(self.pairs) * dull))
         shared, held = self._shared(unexplained), SYSTEMATIC_IMAGE * dull
-        return Witness("vertex", self.image.at, sigma, shared, held, freed=self.lag.at)
+        period_us = self.deaf.period_us
+        per_us = self.put_back / period_us if period_us > 0.0 else 0.0
+        found = Witness(
+            "vertex", self.image.at, sigma, shared, held, freed=self.lag.at, lost_per_us=per_us, deaf_us=period_us
+        )
+        return found.if_deaf_for(self.deaf)
 
     def _shared(self, unexplained: float) -> float:
         share = 0.0 if self.in_focus else unexplained  # where it is in focus, the lag's own error holds it
@@ -212,7 +249,7 @@ def fuse(witnesses: Sequence[Witness]) -> FocusEstimate | None:
     if not witnesses:
         return None
     at = np.array([one.at for one in witnesses])
-    common = np.array([(one.shared, one.held, one.play, one.optics) for one in witnesses])
+    common = np.array([(one.shared, one.held, one.play, one.optics, one.lost) for one in witnesses])
     covariance = np.diag([one.sigma**2 + one.astray**2 for one in witnesses]) + common @ common.T
     precision = np.linalg.inv(covariance)
     share = precision.sum(axis=0) / precision.sum()

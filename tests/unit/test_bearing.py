@@ -12,7 +12,7 @@ from elpd.events.decoder import EventArrays
 from elpd.records import Direction, Frame, Geometry, Roi
 from elpd.units import SensorUs
 from elpd.vision.alignment import displacement_px, laid_on, moved
-from elpd.vision.bearing import Bearing, Gauge, Unrest
+from elpd.vision.bearing import BAND_PX, Bearing, Gauge, Unrest
 from elpd.vision.integral import band_energy, band_gain, band_patch
 from elpd.vision.memory import EventMemory
 from elpd.vision.resting import Resting, order
@@ -71,6 +71,15 @@ def test_a_picture_that_shakes_tells_the_direction(seed: int, end_px: float, dir
 def test_shaking_alone_is_no_direction(seed: int) -> None:
     images = [scene(4.5, int(at)) for at in path(seed)]
     assert judged(Bearing(unrest(seed + 10), MARGIN), images) is Direction.UNKNOWN
+
+
+def test_motion_that_was_listened_to_for_long_does_no_more_however_far_it_goes() -> None:
+    known = unrest()
+    near, far = known.moved(np.array([1.0, 40.0]), np.array([1.0, 1.0]))
+    assert near < far == pytest.approx(known.per_px * BAND_PX)
+    soon, late, later = known.moved(np.zeros(3), np.array([1.0, known.longest_ms, 1e6]))
+    assert soon < late == later
+    assert known.longest_ms == pytest.approx(11.0)
 
 
 def test_what_the_image_lacks_of_a_picture_is_added() -> None:

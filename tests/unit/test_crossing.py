@@ -26,17 +26,22 @@ from elpd.vision.track import EventEnergy, PeakTrack, Sharpness
 from elpd.vision.witness import Witness, frame_witness, fuse
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.floats(0.001, 1.0)), min_size=1, max_size=40))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.booleans(), st.floats(0.001, 1.0), st.floats(1.0, 3.0)), min_size=1, max_size=40
+    )
+)
 def test_rebuilt_levels_are_their_twin(rows: Any) -> None:
     pixel = np.array([row[0] for row in rows], np.int64)
     on = np.array([row[1] for row in rows], np.uint8)
+    steps = (2.0 * on - 1.0) * np.array([row[3] for row in rows])
     position = np.cumsum([row[2] for row in rows])
     ticks = np.linspace(-0.1, position[-1] + 0.5, 17)
     starts, order = group_by_pixel(pixel, 3)
     level = np.zeros((17, 3), np.float32)
-    rebuild_levels(starts, position[order], on[order], ticks, level)
+    rebuild_levels(starts, position[order], steps[order], ticks, level)
     for k in range(3):
-        events = [(float(z), bool(p)) for z, p, one in zip(position, on, pixel, strict=True) if one == k]
+        events = [(float(z), float(p)) for z, p, one in zip(position, steps, pixel, strict=True) if one == k]
         expected = [naive_vision.level_at(events, tick) if events else 0.0 for tick in ticks]
         np.testing.assert_allclose(level[:, k], expected, rtol=1e-5, atol=1e-5)
 

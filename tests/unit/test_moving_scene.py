@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+from benchmarks.retina import Retina, RetinaSettings
 from sweep_world import picture
 
 from elpd.vision import crossing
@@ -14,7 +15,9 @@ from elpd.vision.bands import BandFocus, average_focus, focus_of_bands
 from elpd.vision.crossing import ask_events
 from elpd.vision.integral import BANDS_PX
 from elpd.vision.pairs import Mode
-from elpd.vision.rebuilt import EventStretch
+from elpd.vision.rebuilt import EventStretch, by_pixel, rebuilt
+from elpd.vision.refractory import Refractory
+from elpd.vision.witness import LOSSES_UNEXPLAINED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -162,3 +165,49 @@ def test_silence_tells_nothing_of_pixels_in_a_scene_that_moves(monkeypatch: pyte
     at_rest_deaf, in_motion_deaf = (asked(one).image for one in scenes)
     assert at_rest_deaf != at_rest, "silent pixels have not come back: what they did is taken out"
     assert in_motion_deaf.finest == in_motion.finest
+
+
+def shaken_and_deaf(levels: NDArray[np.float64], deaf_us: float, threshold: float = THRESHOLD) -> EventStretch:
+    """Return what pixels send that are deaf after each event, a millisecond to a step."""
+    light = (60.0 * np.exp(levels - levels.mean())).astype(np.float32)
+    settings = RetinaSettings(threshold, threshold, 0.0, 1e6, 0.0, 0.0, 1e-6 * deaf_us, settled=True)
+    retina = Retina(settings, light[0], 0, 1000 * STEPS, np.random.default_rng(4))
+    for k in range(1, STEPS):
+        retina.see(light[k], 1000.0 * k)
+    events = retina.events()
+    columns = events.t_us, events.x, events.y, events.on
+    position = (events.t_us + deaf_us) / 1000.0
+    return EventStretch(*columns, position, *light[0].shape, MARGIN, deaf=Refractory(deaf_us, 0.1 * deaf_us))
+
+
+def test_what_deaf_pixels_lose_of_a_scene_that_shakes_is_put_back() -> None:
+    levels = seen(defocus, lambda at: 4.0 * float(np.sin(0.07 * at)))
+    events = shaken_and_deaf(levels, 500.0, 0.03)
+    ticks = np.arange(20.0, 140.0, 10.0)
+    truth = (levels[ticks.astype(int)] - levels[0]) / 0.03
+    whole, heard = (rebuilt(one, by_pixel(one), ticks) - truth for one in (events, events.as_heard()))
+    assert np.sqrt(np.mean(np.square(heard))) > 1.5, "thresholds are missing"
+    assert np.mean(np.square(whole)) < 0.3 * np.mean(np.square(heard))
+
+
+def test_how_far_focus_goes_by_that_is_told_and_doubted() -> None:
+    levels = seen(defocus, lambda at: 2.5 * float(np.sin(0.05 * at)))
+    events = shaken_and_deaf(levels, 500.0)
+    before = events.position < END
+    columns = (one[before] for one in (events.t_us, events.x, events.y, events.on, events.position))
+    events = EventStretch(*columns, events.height, events.width, MARGIN, deaf=events.deaf)
+    found, heard = ask_events(events, BEGIN, FOCUS, END), ask_events(events.as_heard(), BEGIN, FOCUS, END)
+    assert found.drift.seen
+    assert found.image is not None
+    assert heard.image is not None
+    assert found.put_back == pytest.approx(found.image.at - heard.image.at)
+    vertex, unheard = found.vertex(), heard.vertex()
+    assert vertex is not None
+    assert unheard is not None
+    assert unheard.lost == 0.0
+    assert vertex.lost == pytest.approx(found.put_back * np.hypot(0.1, LOSSES_UNEXPLAINED))
+    longer = vertex.if_deaf_for(Refractory(600.0, 0.0))
+    assert longer.at - vertex.at == pytest.approx(0.2 * found.put_back)
+    back = vertex.on_the_way_back(0.0, 0.0)
+    assert back.if_deaf_for(Refractory(600.0, 0.0)).at == pytest.approx(-longer.at)
+    assert back.lost == -vertex.lost
