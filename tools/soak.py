@@ -38,6 +38,10 @@ def main() -> int:
     parser.add_argument("--service", type=Path, help="the socket of a running `elpd serve` on the simulated rig")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
+    if chosen.service is not None and not chosen.service.is_socket():
+        parser.error(
+            f"{chosen.service} is no socket: start `elpd serve --config sim` first, which says where it listens"
+        )
     log.configure()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))
     figures = _day(chosen) if chosen.service is None else _hour(chosen)
