@@ -222,13 +222,14 @@ def _sharpest(
     loud = sharpness_curves(images, None if still else light.start, light.worths, light.weight, events.margin)
     first = image_focus(loud[0], ticks, peak)
     hush(images, ticks, events, peak if first is None else first.finest.at)
-    quiet = sharpness_curves(images, light.start, light.worths, light.weight, events.margin)
+    moves = drift.seen and not still
+    quiet = loud if moves else sharpness_curves(images, light.start, light.worths, light.weight, events.margin)
     # Where the whole scene is seen to move, a pixel's silence tells nothing, what is laid below does not lie where the
     # ghost does to the last bit, and two pictures that lie aside show a peak that no blur has made.
     below = GHOSTLESS_BANDS if drift.seen else len(BANDS_PX)
     edges = edges_of_each(images, light.weight, events.margin)
     bands = [len(BANDS_PX) if still and not drift.seen else GHOSTLESS_BANDS, *len(light.worths) * [below]]
-    curves = quiet if still else loud if drift.seen else loud + quiet
+    curves = quiet if still or moves else loud + quiet
     candidates = [
         one
         for curve, count in zip(curves, cycle(bands[: len(quiet)]), strict=False)
