@@ -168,15 +168,21 @@ class Aftermath:
     def sharpened_again(self) -> float | None:
         """Return how much sharper the image became on the way back, as a share of what it had lost since its peak.
 
-        The image that the events build is gone on with; only where the scene moves, else ``None``. To be asked once
-        after each way, with the lens at rest; a second way is held against the first's loss if its own is less.
+        The image that the events build is gone on with, and what pixels lost while deaf is put back, which a scene that
+        shakes would lack at the end. ``None`` under a lamp, with several depths, or where nothing had been lost. To be
+        asked once after each way, with the lens at rest; a second way is held against the first's loss if its own is
+        less.
         """
-        track = self._hearing.memory.track
-        if not self.scene_moves or self._hearing.lamp is not None or not track.drop > 0.0:
+        memory = self._hearing.memory
+        track = memory.track
+        if self.depths_um or self._hearing.lamp is not None or not track.drop > 0.0:
             return None
-        self._lost, far = max(track.drop, self._lost), track.values[-1]
+        peak, far = (memory.sharpness(when) for when in (track.times_us[track.peak], track.times_us[-1]))
+        self._lost = max(peak - far, self._lost)
         self.look()
-        return (track.values[-1] - far) / self._lost
+        if self._lost <= 0.0:
+            return 0.0 if self.scene_moves else None
+        return (memory.sharpness(track.times_us[-1]) - far) / self._lost
 
     def look(self) -> None:
         """Measure how sharp the image is that all events have built."""

@@ -145,7 +145,7 @@ def pass_again(
             doubt = estimate if watch.scene_moves else _lessened(estimate, settings)
             answer, enough = estimate, _certain(doubt, settings)
         elif watch.after.flat is None:
-            answer, enough = first, False
+            enough = False  # and what was believed before this round still is
         else:
             answer, enough = _mixed(first, settings), looks == LOOKS_FOR_MOTION
         if enough or stage.now_ns() + ROUNDS_LEFT * took_ns > deadline_ns:

@@ -167,8 +167,17 @@ class EventMemory:
     def sharpest(self) -> NDArray[np.float32]:
         """Return the image at the peak of the curve, (height, width) in thresholds."""
         until = int(np.searchsorted(self._t_us, self.track.times_us[self.track.peak], side="left"))
-        nothing = BuiltImage(np.zeros(self._shape, np.float32), 0)
-        return self._upon(nothing if self._start is None else self._start, until)
+        return self._upon(self._begun, until)
+
+    def sharpness(self, until_us: int) -> float:
+        """Return log S of the image that events before *until_us* have built, with what pixels lost while deaf."""
+        until = int(np.searchsorted(self._t_us, until_us, side="left"))
+        whole = self._upon(self._begun, until) + self._lost(until)
+        return EventEnergy(*self._shape, ROI_MARGIN_PX, whole).measure()
+
+    @property
+    def _begun(self) -> BuiltImage:
+        return BuiltImage(np.zeros(self._shape, np.float32), 0) if self._start is None else self._start
 
     def change(self) -> NDArray[np.float32]:
         """Return what the events of this memory alone have built, those after the last ``advance`` too."""

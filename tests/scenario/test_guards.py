@@ -88,6 +88,27 @@ def test_a_coupling_that_slips_on_the_return_is_seen_although_the_scene_makes_ev
     assert "sharper" in story.result.reason
 
 
+@pytest.mark.parametrize(
+    ("seed", "condition"),
+    [(67, "sim.motion=shake"), (72, "sim.motion=violent"), (73, "sim.motion=violent"), (62, "sim.noise_hz=100")],
+)
+def test_nor_do_events_hide_it_that_nobody_has_taken_for_motion(seed: int, condition: str) -> None:
+    """A hand that rests while it is listened to, and turns round in focus, is not seen; noise makes events as well."""
+
+    def stick(story: Story) -> None:
+        story.truth.mechanism.stick(story.parts.clock.now_ns())
+
+    assert meet(seed, condition).outcome is Outcome.FOCUSED
+    assert meet(seed, condition, events=(Event("return", 0.0, stick),)).outcome is Outcome.LENS_DID_NOT_MOVE
+
+
+def test_a_pass_that_tells_depths_takes_nothing_back_that_flat_ones_agreed_on() -> None:
+    """In dim light few pairs turn, and the fourth pass takes noise for a second plane."""
+    story = meet(8100, "sim.brightness=0.2")
+    assert story.outcome is Outcome.FOCUSED
+    assert abs(story.errors["final_error_um"]) < 3.0
+
+
 def test_a_flat_scene_under_a_lamp_has_no_texture() -> None:
     story = meet(2, "sim.flicker_hz=100", "sim.flicker_depth=0.3", "sim.scene=flat")
     assert story.outcome is Outcome.NO_TEXTURE
