@@ -78,6 +78,12 @@ def test_a_doubtful_answer_is_looked_at_again_and_a_scene_that_lies_elsewhere_th
     assert begun["sigma_um"] > story.settings.max_sigma_dof * story.settings.depth_of_focus_um
 
 
+def test_a_clear_hill_is_believed_however_much_the_hand_has_shuffled() -> None:
+    story = play("sim.camera=evk4", "sim.motion=shake", "sim.seed=900", "sim.start_um=200", "sim.scene=brick")
+    assert_invariants(story)
+    assert story.outcome is Outcome.FOCUSED
+
+
 def test_where_one_pass_is_enough_no_second_is_made() -> None:
     """A second pass knows focus to half the play, of which the bound counts."""
     story = play("sim.camera=evk4", "sim.seed=1", "sim.start_um=-200", "lens.backlash_um=10")
