@@ -78,7 +78,9 @@ def is_needed(watch: Watch, first: FocusEstimate | None, settings: CycleSettings
         after.take_for_moving()
     if watch.scene_moves or doubtful:
         return True
-    return first is not None and not after.depths_um and (not _certain(first, settings) or _pays(first, settings))
+    if first is None or after.depths_um:
+        return False
+    return not _certain(first, settings) or (settings.cross_again == "better" and _pays(first, settings))
 
 
 def _pays(first: FocusEstimate, settings: CycleSettings) -> bool:

@@ -30,6 +30,7 @@ class CycleSettings:
     max_travel_um: float = 1500.0
     max_reversals: int = 2
     max_sigma_dof: float = MAX_SIGMA_DOF
+    cross_again: Literal["better", "needed"] = "better"
     on_failure: Literal["hold", "start", "preset"] = "start"
     preset_um: float | None = None
     transmittance: Literal["profile", "linear", "iris"] = "profile"

@@ -44,7 +44,7 @@ def test_where_one_pass_is_not_enough_a_second_is_made_and_its_time_is_told() ->
 
 
 @pytest.mark.parametrize("start_um", [-200.0, 200.0])
-def test_a_second_pass_is_the_way_back_and_ends_where_focus_has_been_seen_to_pass(start_um: float) -> None:
+def test_a_cross_again_is_the_way_back_and_ends_where_focus_has_been_seen_to_pass(start_um: float) -> None:
     """From 200 um away: the ramp and 50 ms of sweep, the turn, 20 ms back over focus, 20 ms to it."""
     story = shown("violent", 3, start_um)
     assert story.outcome is Outcome.FOCUSED
@@ -85,8 +85,11 @@ def test_a_clear_hill_is_believed_however_much_the_hand_has_shuffled() -> None:
 
 
 def test_where_one_pass_is_enough_no_second_is_made() -> None:
-    """A second pass knows focus to half the play, of which the bound counts."""
-    story = play("sim.camera=evk4", "sim.seed=1", "sim.start_um=-200", "lens.backlash_um=10")
+    once = "sim.camera=evk4", "sim.seed=1", "sim.start_um=-200"
+    assert "recross" in play(*once).phases, "it knows focus better"
+    # A second pass knows focus to half the play, of which the bound counts.
+    assert "recross" not in play(*once, "lens.backlash_um=10").phases
+    story = play(*once, "focus.cross_again=needed")
     assert_invariants(story)
     assert story.outcome is Outcome.FOCUSED
     assert "recross" not in story.phases
@@ -94,7 +97,7 @@ def test_where_one_pass_is_enough_no_second_is_made() -> None:
     assert story.result.details["method"] != "two_crossings"
 
 
-def test_the_second_pass_leads_back_over_focus_far_enough_to_see_it_passed() -> None:
+def test_the_cross_again_leads_back_over_focus_far_enough_to_see_it_passed() -> None:
     story = shown("violent", 2)  # of the first the sensor at rest sees no motion
     assert "recross" in story.phases
     assert story.result is not None
