@@ -175,7 +175,7 @@ class Aftermath:
         """
         memory = self._hearing.memory
         track = memory.track
-        if self.depths_um or self._hearing.lamp is not None or not track.drop > 0.0:
+        if (self.depths_um and not self.scene_moves) or self._hearing.lamp is not None or not track.drop > 0.0:
             return None
         peak, far = (memory.sharpness(when) for when in (track.times_us[track.peak], track.times_us[-1]))
         self._lost = max(peak - far, self._lost)

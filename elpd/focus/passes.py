@@ -10,6 +10,7 @@ import numpy as np
 
 from elpd.units import SensorUs
 from elpd.vision.drift import find_drift
+from elpd.vision.image_parts import spread_of
 from elpd.vision.pair_focus import PAIRS_REACH
 from elpd.vision.relief import Parts, is_flat
 from elpd.vision.ruler import Ruler
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from elpd.focus.settings import CycleSettings
     from elpd.records import FocusEstimate
     from elpd.vision.flicker import Flicker
+    from elpd.vision.image_parts import ImageParts
     from elpd.vision.memory import EventMemory
     from elpd.vision.refractory import Refractory
     from elpd.vision.track import Sharpness
@@ -42,6 +44,10 @@ isotropy: bricks and a rocket's tower stray three times as far as gravel."""
 LEAST_ISOTROPY = 0.1
 """Below it all edges of a picture point one way, and what is motion and what is blur nobody can tell: noise makes 0.08
 of bars, a rocket's tower has 0.2."""
+
+APART = 1.25
+"""How far parts of a region that moves scatter where it is not at one depth, over what they may in a still one: two
+planes 15 um apart have 2.5 (depth of focus 6 um)."""
 
 FRAMES_IN_MOTION = 0.05
 """What scene motion adds to the error of the frames' vertex, in widths of the curve: the scene has depth and ends, and
@@ -68,6 +74,8 @@ class Testimony:
     """Where the parts of such a region turned."""
     begin_um: float = 0.0
     """How far before focus most of its pairs began."""
+    image_parts: ImageParts | None = None
+    """Where the parts of the region are sharpest, which tells depths where the scene moves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +125,16 @@ class Pass:
         frames = self._fit_frames(locate)
         moved = (*self._frames_in_motion(frames), *self._in_motion(said, undated_um))
         if self.scene_moves or (not said.depths and said.drift.seen):
-            return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True)
+            return Testimony(moved, (), memory.flicker(), deaf, scene_moves=True, image_parts=said.parts)
         witnesses = [
             replace(one, shared=float(np.hypot(one.shared, undated_um)), dated_per_us=1e-6 * self.speed_um_s)
             for one in said.witnesses(unexplained, self.width_um)
         ]
         seen = [] if said.depths or frames is None else [frames.witness]  # of several planes frames show a mixture
-        told = Testimony((*seen, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest())
+        told = Testimony(
+            (*seen, *witnesses), said.depths, memory.flicker(), deaf, False, moved, memory.sharpest(),
+            image_parts=said.parts,
+        )  # fmt: skip
         if said.turns is None:
             return told
         return replace(told, parts=Parts.of(said.turns, PAIRS_REACH * self.width_um), begin_um=said.turns.begin)
@@ -211,6 +222,7 @@ class Passes:
         """How long pixels are deaf after an event, by all that they have sent so far."""
         self.begin_um = 0.0
         """How far before focus most pairs begin, as far as has been seen."""
+        self._flat_within_um = 0.0
         self.flat: bool | None = None
         """Whether the region of a scene that stands still is at one depth; ``None`` where that is not known."""
 
@@ -220,6 +232,7 @@ class Passes:
         A region counts as flat if its parts are in focus at one place to a standard deviation of *flat_within_um*.
         """
         self._said.append((said, sign))
+        self._flat_within_um = flat_within_um
         self._near_us.append(near_us)
         self.depths_um = tuple(sign * at for at in said.depths) or self.depths_um
         self.flicker = said.flicker or self.flicker
@@ -245,7 +258,10 @@ class Passes:
 
     def take_for_moving(self) -> None:
         """Believe of what was said of a scene that was taken for still only what holds where it moves."""
-        self._said = [(said if said.scene_moves else Testimony(said.if_it_moves), sign) for said, sign in self._said]
+        self._said = [
+            (said if said.scene_moves else Testimony(said.if_it_moves, image_parts=said.image_parts), sign)
+            for said, sign in self._said
+        ]
         self.scene_moves = True
 
     @property
@@ -285,12 +301,34 @@ class Passes:
         )
         if found is None:
             return None
+        found = self._of_the_first_depth(found) if self.scene_moves else found
         return replace(
             found,
             method="two_crossings" if len(self._said) > 1 else found.method,
             focus_um=sweep * found.focus_um,
             contributions=tuple((name, sweep * at, sigma, share) for name, at, sigma, share in found.contributions),
         )
+
+    def _of_the_first_depth(self, found: FocusEstimate) -> FocusEstimate:
+        """Return what was found in a scene that moves, for the first of two depths if its parts tell of such.
+
+        Parts that lie further apart than that, but not at two places, are in the error.
+        """
+        there, back = (
+            [said.image_parts for said, sign in self._said if said.image_parts is not None and sign == way]
+            for way in (self.sign, -self.sign)
+        )
+        spread = spread_of(there, back)
+        if spread is None:
+            return found
+        self.depths_um = ()
+        if spread.sigma < APART * self._flat_within_um or not spread.certain:
+            return found
+        if spread.groups is None:
+            return replace(found, sigma_um=float(np.hypot(found.sigma_um, spread.sigma)))
+        depths = tuple(found.focus_um + one for one in spread.groups)
+        self.depths_um = tuple(self.sign * one for one in depths)
+        return replace(found, focus_um=depths[0])
 
 
 def _track_of(points: Sequence[tuple[int, float, Sharpness]]) -> PeakTrack:

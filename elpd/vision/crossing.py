@@ -16,7 +16,15 @@ import numpy as np
 from elpd.vision.astigmatism import edges_of_each
 from elpd.vision.bands import BandFocus, average_focus
 from elpd.vision.drift import LOOKS, Drift, find_drift
-from elpd.vision.image_focus import band_energy_image, image_focus, sharpness_curves, typical_slowness, who_turns
+from elpd.vision.image_focus import (
+    UNANSWERED,
+    band_energy_image,
+    image_focus,
+    sharpness_curves,
+    typical_slowness,
+    who_turns,
+)
+from elpd.vision.image_parts import ImageParts
 from elpd.vision.integral import BANDS_PX, band_gain, inside_margin
 from elpd.vision.lag import Lag, average_lag
 from elpd.vision.light import worth_of_an_event
@@ -152,7 +160,8 @@ def ask_events(
     if planes and not find_drift(rebuilt(events, groups, np.linspace(begin, end, LOOKS))).seen:
         depths = tuple(plane.at for plane in planes)
         return EventWitnesses(None, planes[0], late.typical, 0.0, depths, width, pairs_lag=late.typical.at)
-    if pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX:
+    sampled = pairs is not None and pairs.share > STILL_SHARE and events.height * events.width > SAMPLE_PX
+    if sampled:
         rows = busiest_rows(events, SAMPLE_PX)
         events, light, at_peak = rows_of(events, rows), light.of_rows(rows), at_peak[rows]
         groups = by_pixel(events)
@@ -168,6 +177,10 @@ def ask_events(
     put_back = 0.0
     if drift.seen and image is not None:
         put_back = _put_back(image, events, groups, ticks, peak, light)
+    parts = None
+    if image is not None and not sampled:
+        until = float(ticks[-1]) - UNANSWERED * image.finest.width
+        parts = ImageParts.of(images[::2], ticks[::2], light.weight, events.margin, image, until)
     seen = float((energy[inside_margin(energy.shape, events.margin)]).mean())
     pairs_lag = late.typical
     if drift.seen:
@@ -189,6 +202,7 @@ def ask_events(
         pairs_lag=pairs_lag.at,
         deaf=events.deaf,
         put_back=put_back,
+        parts=parts,
     )
 
 

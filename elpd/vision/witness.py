@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from elpd.vision.bands import BandFocus
+    from elpd.vision.image_parts import ImageParts
     from elpd.vision.integral import Vertex
     from elpd.vision.pairs import Mode
     from elpd.vision.turns import Turns
@@ -162,6 +163,8 @@ class EventWitnesses:
     """How long pixels were taken to be deaf."""
     put_back: float = 0.0
     """How far the image's focus went because what they lost meanwhile was put back."""
+    parts: ImageParts | None = None
+    """Where parts of the image are sharpest, if all of it was asked."""
     turns: Turns | None = None
     """The pairs themselves, as they were asked."""
     in_focus: bool = False

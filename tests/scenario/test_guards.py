@@ -134,6 +134,17 @@ def test_of_several_depths_the_first_met_is_taken_and_all_are_told(seed: int, ap
     assert "several depths" in told(story, "depths")
 
 
+@pytest.mark.parametrize("seed", [8301, 8302, 8308])
+def test_of_two_depths_in_a_hand_that_moves_it_is_the_first_met_too(seed: int) -> None:
+    """Sharpness alone shows their middle."""
+    story = meet(seed, "sim.second_plane_um=15", "sim.motion=moderate", request=MIDDLE, planes=True)
+    assert story.outcome is Outcome.FOCUSED
+    assert story.result is not None
+    assert len(story.result.depths_um) == 2
+    assert abs(story.errors["final_error_um"]) < 5.0
+    assert "several depths" in told(story, "depths")
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_planes_that_are_hard_to_tell_apart_are_the_first_met_or_refused(seed: int) -> None:
     story = meet(seed, "sim.second_plane_um=15", request=MIDDLE, planes=True)

@@ -12,11 +12,14 @@ from elpd.focus import passes as room
 from elpd.focus.heading import Stale
 from elpd.focus.passes import NO_PLAY, Passes
 from elpd.records import Geometry, Roi
+from elpd.vision.image_parts import ImageParts
 from elpd.vision.memory import BuiltImage, EventMemory
 from elpd.vision.witness import Witness
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from elpd.records import FocusEstimate
 
 SIDE = 128
 
@@ -95,3 +98,39 @@ def test_a_picture_is_stale_once_the_scene_has_gone_two_pixels_and_not_while_it_
         assert not follows.is_so or k > 12
     assert follows.is_so
     assert not stands.is_so
+
+
+def in_motion(at_um: float, parts_um: NDArray[np.float64]) -> room.Testimony:
+    moving = Witness("vertex", at_um, 1.0, shared=12.0)
+    return room.Testimony((moving,), scene_moves=True, image_parts=ImageParts(parts_um, np.ones(parts_um.size)))
+
+
+def passed_there_and_back(there_um: NDArray[np.float64], back_um: NDArray[np.float64]) -> tuple[Passes, FocusEstimate]:
+    passes = Passes()
+    passes.add(in_motion(57.0, 57.0 + there_um), 1, (0.0, 1.0), 3.0)
+    passes.add(in_motion(-43.0, -43.0 + back_um), -1, (2.0, 3.0), 3.0)
+    found = passes.estimate(NO_PLAY)
+    assert found is not None
+    return passes, found
+
+
+def test_of_two_depths_in_a_scene_that_moves_the_first_met_is_taken() -> None:
+    apart = np.repeat([-8.0, 7.0], [7, 8])
+    passes, found = passed_there_and_back(apart, -apart)
+    assert found.focus_um == pytest.approx(42.0)
+    assert passes.depths_um == pytest.approx((42.0, 57.0))
+
+
+def test_parts_that_lie_apart_by_chance_are_at_one_depth() -> None:
+    apart = np.repeat([-8.0, 7.0], [7, 8])
+    passes, found = passed_there_and_back(apart, np.zeros(15))
+    assert found.focus_um == pytest.approx(50.0, abs=0.1)
+    assert passes.depths_um == ()
+
+
+def test_parts_at_many_depths_are_in_the_error() -> None:
+    slope = np.linspace(-10.0, 10.0, 16)
+    passes, found = passed_there_and_back(slope, -slope)
+    assert found.focus_um == pytest.approx(50.0, abs=0.1)
+    assert found.sigma_um > 5.0
+    assert passes.depths_um == ()
