@@ -3,8 +3,8 @@
 Pairs tell several depths apart in a scene that stands still (``vision.depths``, ``vision.relief``). Where it moves they
 turn at any time; but sixteen parts of the image have a curve of log S each, and its vertex. Photoreceptors and motion
 make all of them late, so the middle of a pass there and one back is the depth of the part. Half of their difference is
-the same for all parts, so its scatter tells how far chance may have put the middles apart. In flat regions those scatter
-as much (1 to 5 um, depth of focus 6 um), in halves 15 um apart by 7.5 um where chance has 1.5.
+the same for all parts, so its scatter tells how far chance may have put the middles apart. In flat regions those
+scatter as much (1 to 5 um, depth of focus 6 um), in halves 15 um apart by 7.5 um where chance has 1.5.
 """
 
 from __future__ import annotations
