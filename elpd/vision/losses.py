@@ -26,6 +26,13 @@ MOST_LOST = 4.0
 """Thresholds, at the most, between two events: they are as close as the period's error, and anything may have been."""
 
 
+@kernel()
+def unheard(apart_us: float, deaf_us: float) -> float:
+    """Return how many thresholds went by unheard between two events of one sign."""
+    heard_us = max(apart_us - deaf_us, deaf_us / MOST_LOST)
+    return deaf_us / heard_us if heard_us > 0.0 else 0.0
+
+
 @kernel("void(int64[::1], int64[::1], uint8[::1], float64, float64[::1])")
 def steps_with_losses(
     starts: NDArray[np.int64],
@@ -50,8 +57,7 @@ def steps_with_losses(
         for i in range(starts[k], starts[k + 1]):
             after = 0.0
             if i + 1 < starts[k + 1] and (on[i] != 0) == (on[i + 1] != 0):
-                heard_us = max(t_us[i + 1] - t_us[i] - deaf_us, deaf_us / MOST_LOST)
-                after = 0.5 * deaf_us / heard_us if heard_us > 0.0 else 0.0
+                after = 0.5 * unheard(float(t_us[i + 1] - t_us[i]), deaf_us)
             steps[i] = (1.0 + before + after) * (1.0 if on[i] else -1.0)
             before = after
 
@@ -75,9 +81,7 @@ def lost_between_events(
         last[y[i], x[i]] = 2 * t_us[i] + (1 if on[i] else 0)
         if before < 0 or (before % 2 == 1) != (on[i] != 0):
             continue
-        heard_us = max(t_us[i] - before // 2 - deaf_us, deaf_us / MOST_LOST)
-        if heard_us > 0.0:
-            lost[y[i], x[i]] += np.float32((1.0 if on[i] else -1.0) * deaf_us / heard_us)
+        lost[y[i], x[i]] += np.float32((1.0 if on[i] else -1.0) * unheard(float(t_us[i] - before // 2), deaf_us))
 
 
 def lost_levels(

@@ -166,7 +166,7 @@ class EventMemory:
         part = slice(self._taken, self._count)
         _, x, y, on = self._columns
         stamp_events(x[part], y[part], on[part], POINT, levels)
-        return BuiltImage(levels, self._forgotten + self._count, self._lost(self._count))
+        return BuiltImage(levels, self._forgotten + self._count, self._lost(self._count, self.refractory()))
 
     def sharpest(self) -> NDArray[np.float32]:
         """Return the image at the peak of the curve, (height, width) in thresholds."""
@@ -176,7 +176,7 @@ class EventMemory:
     def sharpness(self, until_us: int) -> float:
         """Return log S of the image that events before *until_us* have built, with what pixels lost while deaf."""
         until = int(np.searchsorted(self._t_us, until_us, side="left"))
-        whole = self._upon(self._begun, until) + self._lost(until)
+        whole = self._upon(self._begun, until) + self._lost(until, self.refractory())
         return EventEnergy(*self._shape, ROI_MARGIN_PX, whole).measure()
 
     @property
@@ -241,7 +241,7 @@ class EventMemory:
 
     def refractory(self) -> Refractory:
         """Return how long a pixel is deaf after an event, by the events up to the last ``advance`` and earlier ones."""
-        part = slice(self._taught, max(self._taken, self._taught))
+        part = slice(self._taught, self._taken)
         self.deafness.add(*(column[part] for column in self._columns))
         self._taught = part.stop
         return self.deafness.period()
@@ -325,7 +325,7 @@ class EventMemory:
         height, width = self._shape
         t_us, x, y, on = (column[part] for column in self._columns)
         base = None if self._start is None else self._upon(self._start, begin)
-        lost = None if self._start is None else self._lost(begin)
+        lost = None if self._start is None else self._lost(begin, deaf)
         events = EventStretch(t_us, x, y, on, position, height, width, ROI_MARGIN_PX, base, lost, deaf)
         if begin > 0 or self._forgotten:
             start = None
@@ -350,10 +350,10 @@ class EventMemory:
         stamp_events(x, y, on, POINT, levels)
         return levels
 
-    def _lost(self, count: int) -> NDArray[np.float32]:
-        """Return what the image that the first *count* events have left lacks because pixels were deaf."""
+    def _lost(self, count: int, deaf: Refractory) -> NDArray[np.float32]:
+        """Return what the image that the first *count* events have left lacks because pixels were *deaf*."""
         t_us, x, y, on = (column[:count] for column in self._columns)
-        lost = lost_levels(t_us, x, y, on, self.refractory().period_us, self._shape)
+        lost = lost_levels(t_us, x, y, on, deaf.period_us, self._shape)
         return lost if self._start is None or self._start.lost is None else lost + self._start.lost
 
     def _cut(self, picture: NDArray[np.float32] | None) -> NDArray[np.float32] | None:

@@ -10,7 +10,6 @@ measured.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -202,12 +201,10 @@ class Resting:
             if self._frame is None and self._picture is not None:
                 self.only_picture = self._cut(self._picture())
             return
-        lost = partial(lost_levels, deaf_us=self.deafness.period().period_us, shape=self._size)
-        built, before = BuiltImage(levels, t_us.size, lost(t_us, x, y, on)), None
+        now, since, before = levels, np.ones(t_us.size, np.bool_), None
         if self._frame is not None:
             since = t_us >= self._frame.t_us
             now = self._cut(frame_levels(self._frame.pixels)) + self._levels(pixel[since], on[since])
-            built = BuiltImage(now, int(since.sum()), lost(t_us[since], x[since], y[since], on[since]))
             before = now - levels
         elif self._picture is not None:  # in the middle of the rest it lies where events are best explained
             picture = self._cut(self._picture())
@@ -215,7 +212,9 @@ class Resting:
         if before is not None:
             self.unrest = Unrest.of(self._stills(before, t_us, pixel, on), ROI_MARGIN_PX)
         if self.moves:
-            self.image_at_start = built
+            deaf_us = self.deafness.period().period_us
+            lost = lost_levels(t_us[since], x[since], y[since], on[since], deaf_us, self._size)
+            self.image_at_start = BuiltImage(now, int(since.sum()), lost)
         elif before is not None:  # nothing is gone on with, so all of it is lacking
             self.beneath = before + levels
 

@@ -49,6 +49,10 @@ class Rig:
         for name, value in values.items():
             self.thread.call(setattr, self.daemon, name, value)
 
+    def tells(self, status: dict[str, Any]) -> None:
+        """Let every status from here on be this one."""
+        self.thread.call(self.daemon.answers.__setitem__, "status", lambda _: status)
+
     def until_asked(self, method: str, params: dict[str, Any]) -> None:
         """Wait until this was asked for last, however often before."""
         self.thread.run(

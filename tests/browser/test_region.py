@@ -67,7 +67,7 @@ def test_the_region_by_keyboard(opened: Opener, rig: Rig) -> None:
 def test_a_status_that_is_late_takes_no_region_away_and_one_that_is_new_does(opened: Opener, rig: Rig) -> None:
     page = opened()
     late = rig.daemon._status()
-    rig.thread.call(rig.daemon.answers.__setitem__, "status", lambda _: late)
+    rig.tells(late)
     drag(page, (300, 200), (700, 500))
     rig.asked_for("roi", 2)
     rig.asked_for("status", rig.count("status") + 3)
@@ -79,14 +79,14 @@ def test_a_status_that_is_late_takes_no_region_away_and_one_that_is_new_does(ope
 def test_a_status_of_between_two_changes_takes_the_second_one_not_back(opened: Opener, rig: Rig) -> None:
     page = opened()
     before = rig.daemon._status()
-    rig.thread.call(rig.daemon.answers.__setitem__, "status", lambda _: before)
+    rig.tells(before)
     drag(page, (300, 200), (700, 500))
     rig.asked_for("roi", 2)
     between = rig.daemon._status()
     drag(page, (500, 350), (600, 300))
     moved = rig.asked_for("roi", 3)["set"]
     assert between["roi"] not in (None, moved)
-    rig.thread.call(rig.daemon.answers.__setitem__, "status", lambda _: between)
+    rig.tells(between)
     rig.asked_for("status", rig.count("status") + 3)
     expect(page.locator("#region-summary")).to_have_text(
         f"Region {moved['width']} × {moved['height']} at {moved['x']}, {moved['y']}"
